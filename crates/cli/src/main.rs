@@ -1,0 +1,2 @@
+//! The terrane binary.
+fn main() {}

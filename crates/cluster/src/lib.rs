@@ -1,0 +1,1 @@
+//! Coordinator, workers, clients and launchers.

@@ -1,0 +1,1 @@
+//! Photographs in; features, retrieval, pair selection, matching and verification out.

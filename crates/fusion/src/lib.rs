@@ -1,0 +1,1 @@
+//! Submaps in, one geo-referenced reconstruction out.

@@ -1,0 +1,15 @@
+//! Transforms, cameras, minimal solvers, robust estimation and geodesy.
+//!
+//! This crate knows no images, files, threads or ids: numbers in, numbers out. Frames, units and signs follow
+//! `docs/conventions.md`.
+
+pub mod camera;
+mod rigid3;
+mod seed;
+mod sim3;
+pub mod so3;
+
+pub use camera::{Camera, CameraModel};
+pub use rigid3::Rigid3;
+pub use seed::Seed;
+pub use sim3::Sim3;

@@ -1,0 +1,1 @@
+//! One cluster of matched images in, submaps out.

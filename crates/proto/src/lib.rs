@@ -1,0 +1,1 @@
+//! Generated gRPC messages and their conversion into terrane's own types.

@@ -1,0 +1,17 @@
+//! Ids, images, features, pairs, tracks, submaps and reconstructions, with their codecs, importers and exporters.
+//!
+//! This crate knows what things are and how they are written down. It solves nothing and schedules nothing.
+
+mod features;
+mod ids;
+mod image;
+mod pair;
+mod reconstruction;
+mod submap;
+
+pub use features::{DESCRIPTOR_LEN, Features, Keypoint};
+pub use ids::{CameraId, ClusterId, ComponentId, ImageId, PointIndex};
+pub use image::{CameraRecord, FocalSource, GpsPrior, ImageRecord, ImageTable, Orientation, RejectedImage};
+pub use pair::{ImagePair, MatchedPair, PairKind, PairSummary};
+pub use reconstruction::{Observation, Reconstruction, RegisteredImage, ScenePoint};
+pub use submap::{ImageFate, Submap, SubmapOutcome};

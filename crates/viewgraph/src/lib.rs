@@ -1,0 +1,1 @@
+//! The graph of verified pairs: build, filter, measure and partition with overlap.
