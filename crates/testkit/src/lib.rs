@@ -1,1 +1,7 @@
-//! Synthetic scenes with known truth: view graphs, features, rendered photographs; comparison.
+//! Synthetic scenes with known truth, for tests, benches and the demo.
+//!
+//! Three levels, each a product with its own options: view graphs and features (see [`scene`]), rendered photographs,
+//! and the comparison of a result with the truth (see [`compare`]).
+
+pub mod compare;
+pub mod scene;
