@@ -3,13 +3,21 @@
 //! This crate knows no images, files, threads or ids: numbers in, numbers out. Frames, units and signs follow
 //! `docs/conventions.md`.
 
+pub mod alignment;
 pub mod camera;
+pub mod geodesy;
+mod linear;
+pub mod ransac;
 mod rigid3;
 mod seed;
 mod sim3;
+pub mod small_lm;
 pub mod so3;
+#[cfg(test)]
+mod test_support;
 
 pub use camera::{Camera, CameraModel};
+pub use ransac::{RansacOptions, Robust};
 pub use rigid3::Rigid3;
 pub use seed::Seed;
 pub use sim3::Sim3;
