@@ -1,0 +1,56 @@
+//! Bundle adjustment: poses, intrinsics and points from reprojection errors, by Levenberg–Marquardt with a Schur complement.
+//!
+//! Points are eliminated shard by shard (Brown 1958; Triggs et al. 1999); what remains is a block-sparse system over
+//! poses (six unknowns on the left of `cam_from_world`) and refined intrinsics, solved by a sparse or dense Cholesky
+//! factorisation. Robust losses act by re-weighting.
+//!
+//! Observations whose point starts behind the camera take no part in the solve. A step that would carry a point behind
+//! a camera is shortened for this point; if that does not help it counts as no descent.
+
+mod options;
+mod problem;
+mod report;
+mod shards;
+
+pub use options::{BundleOptions, Gauge};
+pub use problem::{BundleProblem, FocalPrior, PositionPrior, RefineIntrinsics};
+pub use report::{BundleReport, Termination};
+pub use shards::{BundleObservation, BundleShard, InMemoryShards, ShardError, Shards};
+
+/// A problem that can't be solved as given; says what to change.
+#[derive(Debug, thiserror::Error)]
+#[error(transparent)]
+pub struct BundleError(#[from] BundleErrorKind);
+
+#[derive(Debug, thiserror::Error)]
+enum BundleErrorKind {
+    #[error("bundle adjustment: {0}")]
+    Invalid(String),
+    #[error("bundle adjustment")]
+    Shard(#[from] ShardError),
+    #[error("bundle adjustment: reduced camera system: {0}")]
+    Linear(crate::linear::LinearError),
+}
+
+impl BundleError {
+    fn invalid(message: String) -> Self {
+        BundleErrorKind::Invalid(message).into()
+    }
+
+    /// Whether the problem or the options were wrong, rather than a shard's store or the machine's memory.
+    pub fn is_invalid_input(&self) -> bool {
+        matches!(self.0, BundleErrorKind::Invalid(_))
+    }
+}
+
+impl From<ShardError> for BundleError {
+    fn from(error: ShardError) -> Self {
+        BundleErrorKind::Shard(error).into()
+    }
+}
+
+impl From<crate::linear::LinearError> for BundleError {
+    fn from(error: crate::linear::LinearError) -> Self {
+        BundleErrorKind::Linear(error).into()
+    }
+}

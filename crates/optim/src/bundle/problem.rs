@@ -1,0 +1,190 @@
+//! What a bundle adjustment adjusts: poses, intrinsics, and what is known of them beforehand.
+
+use nalgebra::Vector3;
+use terrane_geometry::{Camera, Rigid3};
+
+use super::BundleError;
+
+/// The camera side of a bundle adjustment. Points and observations come in shards ([`super::Shards`]).
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct BundleProblem {
+    /// `cam_from_world` of each pose; refined on the left by `(ω, v)`.
+    pub poses: Vec<Rigid3>,
+    /// Poses to hold, as many as `poses`.
+    pub fixed_poses: Vec<bool>,
+    /// Intrinsics, shared by any number of poses.
+    pub intrinsics: Vec<Camera>,
+    /// For each pose, its index in `intrinsics`.
+    pub intrinsics_of_pose: Vec<u32>,
+    /// For each of the intrinsics, which of its parameters to refine.
+    pub refine: Vec<RefineIntrinsics>,
+    /// Known positions of camera centres, as from GPS.
+    pub position_priors: Vec<PositionPrior>,
+    /// Known focal lengths, as from EXIF.
+    pub focal_priors: Vec<FocalPrior>,
+}
+
+/// Which parameters of a camera to refine.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct RefineIntrinsics {
+    /// The focal length or lengths.
+    pub focal: bool,
+    /// The principal point.
+    pub principal_point: bool,
+    /// The distortion coefficients.
+    pub distortion: bool,
+}
+
+impl RefineIntrinsics {
+    /// Hold everything.
+    pub const NONE: Self = Self { focal: false, principal_point: false, distortion: false };
+    /// Focal length and distortion, with the principal point held.
+    pub const FOCAL_AND_DISTORTION: Self = Self { focal: true, principal_point: false, distortion: true };
+    /// Every parameter.
+    pub const ALL: Self = Self { focal: true, principal_point: true, distortion: true };
+
+    /// The indices of the refined parameters in `camera.params()`, ascending.
+    pub fn params(self, camera: &Camera) -> Vec<usize> {
+        let num_focal = camera.model.num_focal();
+        let mut params = Vec::new();
+        if self.focal {
+            params.extend(0..num_focal);
+        }
+        if self.principal_point {
+            params.extend(num_focal..num_focal + 2);
+        }
+        if self.distortion {
+            params.extend(num_focal + 2..camera.model.num_params());
+        }
+        params
+    }
+}
+
+/// A measured camera centre.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PositionPrior {
+    /// Index of the pose.
+    pub pose: u32,
+    /// The measured centre, in the world's frame and unit.
+    pub center_in_world: Vector3<f64>,
+    /// Standard deviation along each axis of the world; positive.
+    pub sigma_m: Vector3<f64>,
+}
+
+/// A focal length known beforehand; applies to each focal parameter of the intrinsics when focal length is refined.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FocalPrior {
+    /// Index of the intrinsics.
+    pub intrinsics: u32,
+    /// The expected focal length in pixels.
+    pub focal_px: f64,
+    /// Its standard deviation in pixels; positive.
+    pub sigma_px: f64,
+}
+
+impl BundleProblem {
+    /// A problem with every pose free and the same refinement for all intrinsics.
+    pub fn new(
+        poses: Vec<Rigid3>,
+        intrinsics: Vec<Camera>,
+        intrinsics_of_pose: Vec<u32>,
+        refine: RefineIntrinsics,
+    ) -> Self {
+        Self {
+            fixed_poses: vec![false; poses.len()],
+            refine: vec![refine; intrinsics.len()],
+            poses,
+            intrinsics,
+            intrinsics_of_pose,
+            position_priors: Vec::new(),
+            focal_priors: Vec::new(),
+        }
+    }
+
+    /// Checks lengths, indices, finiteness and standard deviations.
+    pub fn validate(&self) -> Result<(), BundleError> {
+        let num_poses = self.poses.len();
+        for (name, length) in
+            [("fixed_poses", self.fixed_poses.len()), ("intrinsics_of_pose", self.intrinsics_of_pose.len())]
+        {
+            if length != num_poses {
+                return Err(BundleError::invalid(format!(
+                    "{name} has {length} entries but there are {num_poses} poses: give one for each"
+                )));
+            }
+        }
+        if self.refine.len() != self.intrinsics.len() {
+            return Err(BundleError::invalid(format!(
+                "refine has {} entries but there are {} intrinsics: give one for each",
+                self.refine.len(),
+                self.intrinsics.len()
+            )));
+        }
+        if u32::try_from(num_poses).is_err() || u32::try_from(self.intrinsics.len()).is_err() {
+            return Err(BundleError::invalid("more than 2^32 poses or intrinsics".to_owned()));
+        }
+        self.validate_values()?;
+        self.validate_priors()
+    }
+
+    fn validate_values(&self) -> Result<(), BundleError> {
+        for (i, pose) in self.poses.iter().enumerate() {
+            let finite = pose.rotation.coords.iter().chain(pose.translation.iter()).all(|v| v.is_finite());
+            if !finite {
+                return Err(BundleError::invalid(format!("pose {i} is not finite: leave it out")));
+            }
+            let intrinsics = self.intrinsics_of_pose[i];
+            if intrinsics as usize >= self.intrinsics.len() {
+                return Err(BundleError::invalid(format!(
+                    "pose {i} names intrinsics {intrinsics} but there are {}",
+                    self.intrinsics.len()
+                )));
+            }
+        }
+        for (i, camera) in self.intrinsics.iter().enumerate() {
+            let finite = camera.params().iter().all(|v| v.is_finite());
+            if !finite || !camera_is_sane(camera) {
+                return Err(BundleError::invalid(format!(
+                    "intrinsics {i} must be finite with a positive focal length"
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    fn validate_priors(&self) -> Result<(), BundleError> {
+        for (i, prior) in self.position_priors.iter().enumerate() {
+            if prior.pose as usize >= self.poses.len() {
+                return Err(BundleError::invalid(format!(
+                    "position prior {i} names pose {} of none",
+                    prior.pose
+                )));
+            }
+            let finite = prior.center_in_world.iter().all(|v| v.is_finite());
+            if !finite || !prior.sigma_m.iter().all(|v| v.is_finite() && *v > 0.0) {
+                return Err(BundleError::invalid(format!(
+                    "position prior {i} must be finite with positive standard deviations"
+                )));
+            }
+        }
+        for (i, prior) in self.focal_priors.iter().enumerate() {
+            if prior.intrinsics as usize >= self.intrinsics.len() {
+                return Err(BundleError::invalid(format!(
+                    "focal prior {i} names intrinsics {} of none",
+                    prior.intrinsics
+                )));
+            }
+            if !prior.focal_px.is_finite() || !prior.sigma_px.is_finite() || prior.sigma_px <= 0.0 {
+                return Err(BundleError::invalid(format!(
+                    "focal prior {i} must be finite with a positive standard deviation"
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Whether the focal lengths are positive and every parameter is finite.
+pub(super) fn camera_is_sane(camera: &Camera) -> bool {
+    camera.params().iter().all(|v| v.is_finite()) && camera.focal_px().iter().all(|f| *f > 0.0)
+}
