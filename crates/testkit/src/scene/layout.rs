@@ -40,19 +40,19 @@ pub enum Layout {
 }
 
 /// A uniform number in [low, high).
-pub(super) fn uniform(rng: &mut impl Rng, low: f64, high: f64) -> f64 {
+pub(crate) fn uniform(rng: &mut impl Rng, low: f64, high: f64) -> f64 {
     let unit = (rng.next_u64() >> 11) as f64 / (1u64 << 53) as f64;
     low + (high - low) * unit
 }
 
 /// A standard normal number (Box & Muller 1958).
-pub(super) fn normal(rng: &mut impl Rng) -> f64 {
+pub(crate) fn normal(rng: &mut impl Rng) -> f64 {
     let radius = (-2.0 * uniform(rng, f64::MIN_POSITIVE, 1.0).ln()).sqrt();
     radius * (std::f64::consts::TAU * uniform(rng, 0.0, 1.0)).cos()
 }
 
 /// A camera at `center` that looks along `forward` with `up` up in the image.
-pub(super) fn look(center: Vector3<f64>, forward: Vector3<f64>, up: Vector3<f64>) -> Rigid3 {
+pub(crate) fn look(center: Vector3<f64>, forward: Vector3<f64>, up: Vector3<f64>) -> Rigid3 {
     let z = forward.normalize();
     let x = z.cross(&up).normalize();
     let y = z.cross(&x);

@@ -11,6 +11,7 @@ use terrane_geometry::{Camera, CameraModel, Rigid3, Seed};
 use terrane_scene::{CameraId, CameraRecord, FocalSource, ImageId, MatchedPair, Reconstruction};
 
 pub use layout::Layout;
+pub(crate) use layout::{look, normal, uniform};
 
 /// What to make. Lengths are metres.
 #[derive(Clone, Debug)]
