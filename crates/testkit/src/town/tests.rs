@@ -11,9 +11,9 @@ fn a_photograph_is_a_jpeg_with_position_and_detail() {
     let town = Town::new(&small());
     let photograph = town.photograph(1);
     let mut reader = std::io::Cursor::new(&photograph.jpeg);
-    let tags = exif::Reader::new().read_from_container(&mut reader).expect("EXIF is readable");
-    let latitude = tags.get_field(exif::Tag::GPSLatitude, exif::In::PRIMARY).expect("has a latitude");
-    let exif::Value::Rational(parts) = &latitude.value else { panic!("latitude is rational") };
+    let tags = ::exif::Reader::new().read_from_container(&mut reader).expect("EXIF is readable");
+    let latitude = tags.get_field(::exif::Tag::GPSLatitude, ::exif::In::PRIMARY).expect("has a latitude");
+    let ::exif::Value::Rational(parts) = &latitude.value else { panic!("latitude is rational") };
     let degrees = parts[0].to_f64() + parts[1].to_f64() / 60.0 + parts[2].to_f64() / 3600.0;
     assert!((degrees - 47.05).abs() < 0.01, "latitude {degrees}");
     assert!(photograph.jpeg.len() > 20_000, "a flat picture compresses to {} bytes", photograph.jpeg.len());
