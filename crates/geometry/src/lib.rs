@@ -3,10 +3,13 @@
 //! This crate knows no images, files, threads or ids: numbers in, numbers out. Frames, units and signs follow
 //! `docs/conventions.md`.
 
+pub mod absolute_pose;
 pub mod alignment;
 pub mod camera;
 pub mod geodesy;
 mod linear;
+pub mod p3p;
+mod polynomial;
 pub mod ransac;
 mod rigid3;
 mod seed;

@@ -3,8 +3,10 @@
 //! Names, order of parameters and pixel convention are COLMAP's: the centre of the top left pixel is (0.5, 0.5).
 
 mod distortion;
+#[cfg(test)]
+mod tests;
 
-use nalgebra::{SMatrix, Vector2, Vector3};
+use nalgebra::{Matrix2, SMatrix, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 /// The most parameters that a model has; Jacobians in parameters have as many columns.
@@ -179,15 +181,18 @@ impl Camera {
     }
 
     /// The image of a point in the camera's frame, or `None` behind the camera or beyond the model's domain.
+    #[inline]
     pub fn project(&self, x_in_cam: &Vector3<f64>) -> Option<Vector2<f64>> {
         if !(x_in_cam.z > f64::EPSILON) {
             return None;
         }
-        let normalized = Vector2::new(x_in_cam.x / x_in_cam.z, x_in_cam.y / x_in_cam.z);
-        Some(self.pixel_from_normalized(&normalized))
+        let inverse_z = 1.0 / x_in_cam.z;
+        let normalized = Vector2::new(x_in_cam.x * inverse_z, x_in_cam.y * inverse_z);
+        let distorted = distortion::distort_in_domain(self.model, self.distortion(), &normalized)?;
+        Some(self.principal_point_px() + self.focal_px().component_mul(&distorted))
     }
 
-    /// The pixel of a point on the plane z = 1 of the camera's frame.
+    /// The pixel of a point on the plane z = 1 of the camera's frame, by the model's formula even beyond its domain.
     pub fn pixel_from_normalized(&self, normalized: &Vector2<f64>) -> Vector2<f64> {
         let distorted = distortion::distort(self.model, self.distortion(), normalized);
         self.principal_point_px() + self.focal_px().component_mul(&distorted)
@@ -200,19 +205,9 @@ impl Camera {
         }
         let inverse_z = 1.0 / x_in_cam.z;
         let normalized = Vector2::new(x_in_cam.x * inverse_z, x_in_cam.y * inverse_z);
-        let distorted = distortion::distort_with_jacobian(self.model, self.distortion(), &normalized);
+        let distorted = distortion::distort_with_jacobian(self.model, self.distortion(), &normalized)?;
         let focal = self.focal_px();
-        let d_normalized = SMatrix::<f64, 2, 3>::new(
-            inverse_z,
-            0.0,
-            -normalized.x * inverse_z,
-            0.0,
-            inverse_z,
-            -normalized.y * inverse_z,
-        );
-        let mut d_point = distorted.d_xy * d_normalized;
-        d_point.row_mut(0).scale_mut(focal.x);
-        d_point.row_mut(1).scale_mut(focal.y);
+        let d_point = point_jacobian(&focal, &distorted.d_xy, &normalized, inverse_z);
         let num_focal = self.model.num_focal();
         let mut d_params = SMatrix::<f64, 2, MAX_PARAMS>::zeros();
         d_params[(0, 0)] = distorted.xy.x;
@@ -225,6 +220,24 @@ impl Camera {
         }
         let xy_px = self.principal_point_px() + focal.component_mul(&distorted.xy);
         Some(Projection { xy_px, d_point, d_params })
+    }
+
+    /// [`Camera::project`] with the derivative in the point alone, for hot loops with fixed intrinsics.
+    #[inline]
+    pub fn project_with_point_jacobian(
+        &self,
+        x_in_cam: &Vector3<f64>,
+    ) -> Option<(Vector2<f64>, SMatrix<f64, 2, 3>)> {
+        if !(x_in_cam.z > f64::EPSILON) {
+            return None;
+        }
+        let inverse_z = 1.0 / x_in_cam.z;
+        let normalized = Vector2::new(x_in_cam.x * inverse_z, x_in_cam.y * inverse_z);
+        let (distorted, d_xy) =
+            distortion::distort_with_point_jacobian(self.model, self.distortion(), &normalized)?;
+        let focal = self.focal_px();
+        let xy_px = self.principal_point_px() + focal.component_mul(&distorted);
+        Some((xy_px, point_jacobian(&focal, &d_xy, &normalized, inverse_z)))
     }
 
     /// The point on the plane z = 1 that a pixel sees, or `None` when the distortion can't be inverted there.
@@ -242,4 +255,24 @@ impl Camera {
     pub fn normalized_from_px(&self, length_px: f64) -> f64 {
         length_px / self.mean_focal_px()
     }
+}
+
+/// The derivative of a pixel in the point in the camera's frame, by the chain rule through z = 1 and the distortion.
+#[inline]
+fn point_jacobian(
+    focal_px: &Vector2<f64>,
+    d_xy: &Matrix2<f64>,
+    normalized: &Vector2<f64>,
+    inverse_z: f64,
+) -> SMatrix<f64, 2, 3> {
+    let (row_x, row_y) = (focal_px.x * inverse_z, focal_px.y * inverse_z);
+    let along = d_xy * normalized;
+    SMatrix::<f64, 2, 3>::new(
+        row_x * d_xy.m11,
+        row_x * d_xy.m12,
+        -row_x * along.x,
+        row_y * d_xy.m21,
+        row_y * d_xy.m22,
+        -row_y * along.y,
+    )
 }

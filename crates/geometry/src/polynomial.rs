@@ -1,0 +1,299 @@
+//! Real roots of polynomials: closed forms up to degree three, Sturm's theorem above.
+//!
+//! Coefficients are given from the constant term up. Roots come in no particular order unless said; double roots may be
+//! reported once or, when rounding parts them from the real axis, not at all.
+
+use smallvec::SmallVec;
+
+/// Real roots of `c[0] + c[1] x + c[2] x²`, without cancellation.
+pub(crate) fn quadratic_roots(c: [f64; 3]) -> SmallVec<[f64; 3]> {
+    let mut roots = SmallVec::<[f64; 3]>::new();
+    let half = 0.5 * c[1];
+    let discriminant = half * half - c[0] * c[2];
+    if !(discriminant >= 0.0) {
+        return roots;
+    }
+    let q = -(half + discriminant.sqrt().copysign(half));
+    if c[2] != 0.0 {
+        roots.push(q / c[2]);
+    }
+    if q != 0.0 {
+        roots.push(c[0] / q);
+    }
+    roots.retain(|root| root.is_finite());
+    roots
+}
+
+/// Real roots of `c[0] + c[1] x + c[2] x² + c[3] x³` (Viète's and Cardano's formulae), polished by Newton's method.
+pub(crate) fn cubic_roots(c: [f64; 4]) -> SmallVec<[f64; 3]> {
+    let largest = c.iter().fold(0.0, |m: f64, value| m.max(value.abs()));
+    if !(c[3].abs() > 1e-14 * largest) {
+        return quadratic_roots([c[0], c[1], c[2]]);
+    }
+    let [c0, c1, c2] = [c[0] / c[3], c[1] / c[3], c[2] / c[3]];
+    let shift = -c2 / 3.0;
+    let q = (c2 * c2 - 3.0 * c1) / 9.0;
+    let r = (c2 * (2.0 * c2 * c2 - 9.0 * c1) + 27.0 * c0) / 54.0;
+    let mut roots = SmallVec::<[f64; 3]>::new();
+    if r * r < q * q * q {
+        let angle = (r / (q * q * q).sqrt()).clamp(-1.0, 1.0).acos();
+        for turn in 0..3 {
+            let third = (angle + std::f64::consts::TAU * f64::from(turn)) / 3.0;
+            roots.push(-2.0 * q.sqrt() * third.cos() + shift);
+        }
+    } else {
+        let a = -(r.abs() + (r * r - q * q * q).max(0.0).sqrt()).cbrt().copysign(r);
+        let b = if a == 0.0 { 0.0 } else { q / a };
+        roots.push(a + b + shift);
+    }
+    for root in &mut roots {
+        for _ in 0..2 {
+            let value = c0 + *root * (c1 + *root * (c2 + *root));
+            let slope = c1 + *root * (2.0 * c2 + 3.0 * *root);
+            let next = *root - value / slope;
+            if next.is_finite() {
+                *root = next;
+            }
+        }
+    }
+    roots.retain(|root| root.is_finite());
+    roots
+}
+
+/// Real roots of a polynomial of degree 10, isolated by Sturm's theorem (1829) and polished by safeguarded Newton steps.
+///
+/// Roots outside [-1, 1] are found as inverses of those of the reversed polynomial, so that all work is well scaled.
+pub(crate) fn degree_ten_roots(c: &[f64; 11]) -> SmallVec<[f64; 10]> {
+    let mut roots = SmallVec::new();
+    let largest = c.iter().fold(0.0, |m: f64, value| m.max(value.abs()));
+    if !(largest > 0.0 && largest.is_finite()) {
+        return roots;
+    }
+    let scaled = c.map(|value| value / largest);
+    roots_in_unit_interval(&scaled, &mut roots);
+    let mut reversed = scaled;
+    reversed.reverse();
+    let mut inverse = SmallVec::<[f64; 10]>::new();
+    roots_in_unit_interval(&reversed, &mut inverse);
+    roots.extend(inverse.into_iter().filter(|w| w.abs() < 1.0 && *w != 0.0).map(|w| 1.0 / w));
+    roots.retain(|root| root.is_finite());
+    roots
+}
+
+fn roots_in_unit_interval(c: &[f64; 11], roots: &mut SmallVec<[f64; 10]>) {
+    let chain = SturmChain::new(c);
+    let (low, high) = (-1.0, 1.0);
+    chain.isolate(c, (low, chain.sign_changes(low)), (high, chain.sign_changes(high)), roots);
+}
+
+/// Sturm's chain as quotients: `p[i+1] = (a x + b) p[i] - p[i+2]` evaluated downwards from the last two.
+struct SturmChain {
+    members: [[f64; 11]; 11],
+    degrees: [usize; 11],
+    len: usize,
+}
+
+impl SturmChain {
+    fn new(c: &[f64; 11]) -> Self {
+        let mut chain = Self { members: [[0.0; 11]; 11], degrees: [0; 11], len: 0 };
+        let mut degree = 10;
+        while degree > 0 && c[degree].abs() < 1e-15 {
+            degree -= 1;
+        }
+        chain.push(*c, degree);
+        if degree == 0 {
+            return chain;
+        }
+        let mut derivative = [0.0; 11];
+        for i in 1..=degree {
+            derivative[i - 1] = c[i] * i as f64;
+        }
+        chain.push(derivative, degree - 1);
+        while chain.degrees[chain.len - 1] > 0 {
+            let (remainder, degree) = chain.negated_remainder();
+            if remainder[..=degree].iter().all(|value| value.abs() < 1e-15) {
+                break;
+            }
+            chain.push(remainder, degree);
+        }
+        chain
+    }
+
+    /// Adds a member, scaled to largest coefficient one (a positive factor keeps all signs).
+    fn push(&mut self, mut member: [f64; 11], degree: usize) {
+        let largest = member[..=degree].iter().fold(0.0, |m: f64, value| m.max(value.abs()));
+        if largest > 0.0 {
+            member.iter_mut().for_each(|value| *value /= largest);
+        }
+        self.members[self.len] = member;
+        self.degrees[self.len] = degree;
+        self.len += 1;
+    }
+
+    /// Minus the remainder of the last but one member by the last, scaled, with its degree.
+    fn negated_remainder(&self) -> ([f64; 11], usize) {
+        let (divisor, divisor_degree) = (&self.members[self.len - 1], self.degrees[self.len - 1]);
+        let mut rest = self.members[self.len - 2];
+        for top in (divisor_degree..=self.degrees[self.len - 2]).rev() {
+            let factor = rest[top] / divisor[divisor_degree];
+            for i in 0..=divisor_degree {
+                rest[top - divisor_degree + i] -= factor * divisor[i];
+            }
+            rest[top] = 0.0;
+        }
+        let mut degree = divisor_degree.saturating_sub(1);
+        let largest = rest[..=degree].iter().fold(0.0, |m: f64, value| m.max(value.abs()));
+        while degree > 0 && rest[degree].abs() < 1e-13 * largest {
+            degree -= 1;
+        }
+        (rest.map(|value| -value), degree)
+    }
+
+    fn sign_changes(&self, x: f64) -> usize {
+        let (mut changes, mut last) = (0, 0.0);
+        for i in 0..self.len {
+            let value = evaluate(&self.members[i][..=self.degrees[i]], x);
+            if value != 0.0 {
+                changes += usize::from(value * last < 0.0);
+                last = value.signum();
+            }
+        }
+        changes
+    }
+
+    /// Bisects until each part holds one root, then polishes it.
+    fn isolate(&self, c: &[f64; 11], low: (f64, usize), high: (f64, usize), roots: &mut SmallVec<[f64; 10]>) {
+        let count = low.1.saturating_sub(high.1);
+        if count == 0 {
+            return;
+        }
+        if count == 1 || high.0 - low.0 < 1e-12 {
+            if let Some(root) = polish(c, low.0, high.0) {
+                roots.push(root);
+            }
+            return;
+        }
+        let middle = 0.5 * (low.0 + high.0);
+        let middle = (middle, self.sign_changes(middle));
+        self.isolate(c, low, middle, roots);
+        self.isolate(c, middle, high, roots);
+    }
+}
+
+#[inline]
+fn evaluate(c: &[f64], x: f64) -> f64 {
+    c.iter().rev().fold(0.0, |sum, value| sum * x + value)
+}
+
+/// The root between bounds of different sign by Newton's method, with bisection whenever it leaves them.
+fn polish(c: &[f64; 11], mut low: f64, mut high: f64) -> Option<f64> {
+    let (at_low, at_high) = (evaluate(c, low), evaluate(c, high));
+    if at_low == 0.0 {
+        return Some(low);
+    }
+    if at_high == 0.0 {
+        return Some(high);
+    }
+    if at_low * at_high > 0.0 {
+        // A double root that rounding made two: its middle is as good as any.
+        return (high - low < 1e-10).then_some(0.5 * (low + high));
+    }
+    let mut x = 0.5 * (low + high);
+    for _ in 0..60 {
+        let (mut value, mut slope) = (0.0, 0.0);
+        for coefficient in c.iter().rev() {
+            slope = slope * x + value;
+            value = value * x + coefficient;
+        }
+        if value * at_low > 0.0 {
+            low = x
+        } else {
+            high = x
+        }
+        let newton = x - value / slope;
+        let next = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
+        if (next - x).abs() <= 1e-15 * (1.0 + x.abs()) {
+            return Some(next);
+        }
+        x = next;
+    }
+    Some(x)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::test_support::Random;
+
+    /// The coefficients of the product of `x - root` over the roots.
+    fn from_roots<const N: usize>(roots: &[f64]) -> [f64; N] {
+        let mut c = [0.0; N];
+        c[0] = 1.0;
+        for (degree, root) in roots.iter().enumerate() {
+            for i in (0..=degree + 1).rev() {
+                c[i] = if i > 0 { c[i - 1] } else { 0.0 } - root * c[i];
+            }
+        }
+        c
+    }
+
+    fn assert_roots(mut found: Vec<f64>, mut truth: Vec<f64>, tolerance: f64) {
+        found.sort_by(f64::total_cmp);
+        truth.sort_by(f64::total_cmp);
+        assert_eq!(found.len(), truth.len(), "{found:?} {truth:?}");
+        for (a, b) in found.iter().zip(&truth) {
+            assert!((a - b).abs() < tolerance * (1.0 + b.abs()), "{found:?} {truth:?}");
+        }
+    }
+
+    #[test]
+    fn cubics_and_quadratics_give_their_roots_back() {
+        let mut random = Random::new("cubic");
+        for _ in 0..1000 {
+            let truth: Vec<f64> = (0..3).map(|i| f64::from(i) + random.uniform(-0.4, 0.4)).collect();
+            let c: [f64; 4] = from_roots(&truth);
+            let gain = random.uniform(-5.0, 5.0);
+            assert_roots(cubic_roots(c.map(|value| value * gain)).to_vec(), truth.clone(), 1e-10);
+            let c: [f64; 3] = from_roots(&truth[..2]);
+            assert_roots(quadratic_roots(c).to_vec(), truth[..2].to_vec(), 1e-10);
+        }
+        assert_roots(cubic_roots([-8.0, 0.0, 0.0, 1.0]).to_vec(), vec![2.0], 1e-12);
+        assert_roots(cubic_roots([-4.0, 0.0, 1.0, 0.0]).to_vec(), vec![-2.0, 2.0], 1e-12);
+        assert_roots(quadratic_roots([-4.0, 2.0, 0.0]).to_vec(), vec![2.0], 1e-12);
+        assert!(quadratic_roots([1.0, 0.0, 1.0]).is_empty());
+        assert!(cubic_roots([f64::NAN; 4]).is_empty() && cubic_roots([0.0; 4]).is_empty());
+    }
+
+    #[test]
+    fn all_real_roots_of_degree_ten_are_found() {
+        let mut random = Random::new("sturm");
+        for _ in 0..500 {
+            let truth: Vec<f64> =
+                (0..10).map(|i| 0.35 * (f64::from(i) - 4.5) + random.uniform(-0.1, 0.1)).collect();
+            assert_roots(degree_ten_roots(&from_roots(&truth)).to_vec(), truth, 1e-6);
+        }
+    }
+
+    #[test]
+    fn complex_pairs_are_left_out_and_far_roots_found() {
+        let mut random = Random::new("sturm complex");
+        for _ in 0..500 {
+            let truth: Vec<f64> = vec![random.uniform(-60.0, -20.0), random.uniform(-0.9, 0.9), 3.0, 1.5];
+            let mut c: [f64; 11] = from_roots(&truth);
+            for _ in 0..3 {
+                // Times x² + b x + c without real roots.
+                let b = random.uniform(-1.0, 1.0);
+                let old = c;
+                c = std::array::from_fn(|i| {
+                    let at = |k: usize| if i >= k { old[i - k] } else { 0.0 };
+                    at(2) + b * at(1) + 1.3 * at(0)
+                });
+            }
+            assert_roots(degree_ten_roots(&c).to_vec(), truth, 1e-7);
+        }
+        assert!(degree_ten_roots(&[f64::NAN; 11]).is_empty() && degree_ten_roots(&[0.0; 11]).is_empty());
+        let mut constant = [0.0; 11];
+        constant[0] = 3.0;
+        assert!(degree_ten_roots(&constant).is_empty());
+    }
+}
