@@ -4,5 +4,8 @@
 //! and options give the same bytes on any number of threads.
 
 mod error;
+pub mod matching;
+pub mod pairs;
+pub mod retrieval;
 
 pub use error::FrontendError;

@@ -1,0 +1,180 @@
+//! AVX2: tiles of four rows by sixteen columns, exact in integers.
+//!
+//! `vpmaddubsw` multiplies unsigned by signed bytes and adds neighbours, but saturates in i16. Columns are stored less
+//! an offset: 64 when no byte exceeds 127, so that a row byte (at most 127) times a column byte (-64 to 63) is at most
+//! 8,128 in size and *four* products still fit; two multiplications then share one widening. Tiles with a greater byte
+//! widen bytes to i16 first (`vpmaddwd`). The offset's share, `offset · Σ row`, is added at the end.
+
+use std::arch::x86_64::*;
+
+use terrane_scene::DESCRIPTOR_LEN;
+
+use super::nearest::{Best, Nearest};
+use super::pack::{Block, Packed, QUADS, Side};
+
+/// Rows of a tile.
+const ROWS: usize = 4;
+/// Columns of a block: the i32 lanes of a register.
+const WIDTH: usize = 8;
+/// Blocks of columns in a tile.
+const GROUP: usize = 2;
+/// Blocks of columns that stay in the first-level cache while all rows pass: 16 KiB.
+const CACHED_BLOCKS: usize = 16;
+
+type Tile = [[__m256i; GROUP]; ROWS];
+
+/// Whether this processor can run this path.
+pub(super) fn is_available() -> bool {
+    is_x86_feature_detected!("avx2")
+}
+
+/// Nearest neighbours in both directions. Falls back to the scalar path where AVX2 is missing.
+pub(super) fn nearest(first: &[[u8; DESCRIPTOR_LEN]], second: &[[u8; DESCRIPTOR_LEN]]) -> Nearest {
+    if !is_available() {
+        return super::scalar::nearest(first, second);
+    }
+    let rows = Packed::new(first, Side::Rows, 1);
+    let columns = Packed::new(second, Side::Columns, GROUP);
+    let mut state =
+        State { row_best: Best::new(rows.num_lanes()), column_best: Best::new(columns.num_lanes()) };
+    // SAFETY: the processor has AVX2, as `is_available` has just found.
+    unsafe { sweep(&rows, &columns, &mut state) };
+    Nearest {
+        rows: state.row_best.neighbours(&rows.order, &columns.order),
+        columns: state.column_best.neighbours(&columns.order, &rows.order),
+    }
+}
+
+struct State {
+    row_best: Best,
+    column_best: Best,
+}
+
+#[target_feature(enable = "avx2")]
+fn sweep(rows: &Packed<ROWS>, columns: &Packed<WIDTH>, state: &mut State) {
+    for cached in (0..columns.blocks.len()).step_by(CACHED_BLOCKS) {
+        let end = (cached + CACHED_BLOCKS).min(columns.blocks.len());
+        for strip in 0..rows.blocks.len() {
+            for group in (cached..end).step_by(GROUP) {
+                tile(rows, columns, (strip, group), state);
+            }
+        }
+    }
+}
+
+#[target_feature(enable = "avx2")]
+#[inline]
+fn tile(rows: &Packed<ROWS>, columns: &Packed<WIDTH>, (strip, group): (usize, usize), state: &mut State) {
+    let row_lanes = &rows.lanes[strip];
+    let blocks = [&columns.blocks[group], &columns.blocks[group + 1]];
+    let column_lanes = [&columns.lanes[group], &columns.lanes[group + 1]];
+    let narrow = row_lanes.narrow && column_lanes[0].narrow && column_lanes[1].narrow;
+    let dots = if narrow {
+        dots_narrow(&rows.blocks[strip], blocks)
+    } else {
+        dots_wide(&rows.blocks[strip], blocks)
+    };
+
+    let row_second: &[i32; ROWS] = lanes_at(&state.row_best.second, strip);
+    let mut scores = dots;
+    let mut better = dots;
+    let mut any = _mm256_setzero_si256();
+    for c in 0..GROUP {
+        let column_second = load(lanes_at(&state.column_best.second, group + c));
+        let minus_norm = load(&column_lanes[c].minus_norm);
+        for r in 0..ROWS {
+            let constant = row_lanes.minus_norm[r] + column_lanes[c].offset * row_lanes.twice_sum[r];
+            let constant = _mm256_add_epi32(minus_norm, _mm256_set1_epi32(constant));
+            scores[r][c] = _mm256_add_epi32(_mm256_slli_epi32::<1>(dots[r][c]), constant);
+            better[r][c] = _mm256_or_si256(
+                _mm256_cmpgt_epi32(scores[r][c], _mm256_set1_epi32(row_second[r])),
+                _mm256_cmpgt_epi32(scores[r][c], column_second),
+            );
+            any = _mm256_or_si256(any, better[r][c]);
+        }
+    }
+    if _mm256_testz_si256(any, any) == 0 {
+        offer(&scores, &better, (strip, group), state);
+    }
+}
+
+/// Products of bytes that are all at most 127.
+#[target_feature(enable = "avx2")]
+#[inline]
+fn dots_narrow(rows: &Block<ROWS>, columns: [&Block<WIDTH>; GROUP]) -> Tile {
+    let ones = _mm256_set1_epi16(1);
+    let mut dots = [[_mm256_setzero_si256(); GROUP]; ROWS];
+    for quad in (0..QUADS).step_by(2) {
+        for r in 0..ROWS {
+            let even = _mm256_set1_epi32(rows.0[quad][r]);
+            let odd = _mm256_set1_epi32(rows.0[quad + 1][r]);
+            for c in 0..GROUP {
+                let four = _mm256_add_epi16(
+                    _mm256_maddubs_epi16(even, load(&columns[c].0[quad])),
+                    _mm256_maddubs_epi16(odd, load(&columns[c].0[quad + 1])),
+                );
+                dots[r][c] = _mm256_add_epi32(dots[r][c], _mm256_madd_epi16(four, ones));
+            }
+        }
+    }
+    dots
+}
+
+/// Products of any bytes.
+#[target_feature(enable = "avx2")]
+#[inline]
+fn dots_wide(rows: &Block<ROWS>, columns: [&Block<WIDTH>; GROUP]) -> Tile {
+    let low_bytes = _mm256_set1_epi16(0xff);
+    let mut dots = [[_mm256_setzero_si256(); GROUP]; ROWS];
+    for quad in 0..QUADS {
+        for c in 0..GROUP {
+            let column = load(&columns[c].0[quad]);
+            let column_even = _mm256_srai_epi16::<8>(_mm256_slli_epi16::<8>(column));
+            let column_odd = _mm256_srai_epi16::<8>(column);
+            for r in 0..ROWS {
+                let row = _mm256_set1_epi32(rows.0[quad][r]);
+                let even = _mm256_madd_epi16(_mm256_and_si256(row, low_bytes), column_even);
+                let odd = _mm256_madd_epi16(_mm256_srli_epi16::<8>(row), column_odd);
+                dots[r][c] = _mm256_add_epi32(dots[r][c], _mm256_add_epi32(even, odd));
+            }
+        }
+    }
+    dots
+}
+
+/// Offers the few scores of a tile that beat a second best.
+#[target_feature(enable = "avx2")]
+#[inline(never)]
+fn offer(scores: &Tile, better: &Tile, (strip, group): (usize, usize), state: &mut State) {
+    for r in 0..ROWS {
+        for c in 0..GROUP {
+            let mut mask = _mm256_movemask_ps(_mm256_castsi256_ps(better[r][c])) as u32;
+            if mask == 0 {
+                continue;
+            }
+            let mut values = [0; WIDTH];
+            // SAFETY: `values` is 32 bytes long, and the store needs no alignment.
+            unsafe { _mm256_storeu_si256(values.as_mut_ptr().cast(), scores[r][c]) };
+            while mask != 0 {
+                let lane = mask.trailing_zeros() as usize;
+                mask &= mask - 1;
+                let (row, column) = (strip * ROWS + r, (group + c) * WIDTH + lane);
+                state.row_best.offer(row, column, values[lane]);
+                state.column_best.offer(column, row, values[lane]);
+            }
+        }
+    }
+}
+
+#[target_feature(enable = "avx2")]
+#[inline]
+fn load(words: &[i32; WIDTH]) -> __m256i {
+    // SAFETY: the reference covers 32 bytes, and the load needs no alignment.
+    unsafe { _mm256_loadu_si256(words.as_ptr().cast()) }
+}
+
+/// The `block`-th group of `L` values.
+#[inline]
+fn lanes_at<const L: usize>(values: &[i32], block: usize) -> &[i32; L] {
+    &values.as_chunks::<L>().0[block]
+}
