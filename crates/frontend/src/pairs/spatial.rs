@@ -9,6 +9,7 @@ use std::num::NonZero;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::Vector3;
 use rayon::prelude::*;
+use terrane_geometry::geodesy::{Geodetic, ecef_from_geodetic};
 use terrane_scene::{ImageRecord, ImageTable};
 
 use super::PairOptions;
@@ -65,13 +66,7 @@ pub(super) fn position_m(image: &ImageRecord) -> Option<Vector3<f64>> {
     if !is_possible || (latitude == 0.0 && longitude == 0.0) {
         return None;
     }
-    // Semi-major axis and squared eccentricity of WGS 84.
-    let (axis_m, eccentricity_squared) = (6_378_137.0, 6.694_379_990_141_33e-3);
-    let (sin_lat, cos_lat) = latitude.to_radians().sin_cos();
-    let (sin_lon, cos_lon) = longitude.to_radians().sin_cos();
-    let normal_m = axis_m / (1.0 - eccentricity_squared * sin_lat * sin_lat).sqrt();
-    let x = Vector3::new(cos_lat * cos_lon, cos_lat * sin_lon, (1.0 - eccentricity_squared) * sin_lat);
-    Some(normal_m * x)
+    Some(ecef_from_geodetic(&Geodetic::from_degrees(latitude, longitude, 0.0)))
 }
 
 /// Different positions, and the images at each.
