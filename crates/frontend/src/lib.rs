@@ -3,9 +3,13 @@
 //! Everything takes bytes or values, never paths: reading files is the caller's. Every function is pure: the same input
 //! and options give the same bytes on any number of threads.
 
+pub mod cameras;
 mod error;
+pub mod image;
 pub mod matching;
+pub mod metadata;
 pub mod pairs;
 pub mod retrieval;
+pub mod sift;
 
 pub use error::FrontendError;

@@ -1,0 +1,1 @@
+//! Decoding of whole and of broken files.

@@ -1,0 +1,1 @@
+//! Metadata of whole and of broken files.

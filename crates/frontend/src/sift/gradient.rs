@@ -1,0 +1,263 @@
+//! Gradients around a keypoint, and the kernels that gather them into histograms.
+
+use super::isa::{Isa, kernel};
+use super::math::{direction_in_eighths, exp_f32};
+use super::octave::FixedPlane;
+
+/// Pixels that are turned into gradients at once.
+const LANES: usize = 16;
+/// The widest window: a descriptor's diagonal at the coarsest level, in whole blocks.
+const MAX_SPAN: usize = 96;
+
+/// Bins of an orientation histogram (Lowe 2004).
+pub(super) const ORIENTATION_BINS: usize = 36;
+/// Cells of a descriptor along one axis, and directions in each (Lowe 2004).
+pub(super) const CELLS: usize = 4;
+pub(super) const DIRECTIONS: usize = 8;
+
+/// A descriptor while it is gathered: cells with a rim of one on each side, directions with room for the last one's
+/// neighbours, which fold back onto the first.
+pub(super) const RIMMED_CELLS: usize = CELLS + 2;
+pub(super) const ROOMY_DIRECTIONS: usize = DIRECTIONS + 2;
+pub(super) const ROOMY_LEN: usize = RIMMED_CELLS * RIMMED_CELLS * ROOMY_DIRECTIONS;
+
+/// A place in a level of the scale space.
+#[derive(Clone, Copy)]
+pub(super) struct Place<'a> {
+    pub plane: &'a FixedPlane,
+    pub x: f32,
+    pub y: f32,
+    pub sigma: f32,
+}
+
+/// The axes of a descriptor: cosine and sine of its orientation over the width of a cell, and the orientation in
+/// eighths of a turn.
+#[derive(Clone, Copy)]
+pub(super) struct Frame {
+    pub cosine: f32,
+    pub sine: f32,
+    pub eighths: f32,
+}
+
+kernel!(
+    /// Adds the gradients within 4.5 sigma, weighted by a Gaussian of 1.5 sigma, to a histogram of directions.
+    gather_orientations = gather_orientations_body(place: &Place<'_>, histogram: &mut [f32; ORIENTATION_BINS])
+);
+kernel!(
+    /// Adds the gradients of a descriptor's window, trilinearly interpolated between cells and directions and weighted by
+    /// a Gaussian of two cells.
+    gather_descriptor = gather_descriptor_body(place: &Place<'_>, frame: &Frame, histogram: &mut [f32; ROOMY_LEN])
+);
+
+/// Strength (without a common factor) and direction in eighths of a turn of [`LANES`] gradients.
+struct Gradients {
+    magnitude: [f32; LANES],
+    direction: [f32; LANES],
+}
+
+#[inline(always)]
+fn gradients(plane: &FixedPlane, x: usize, y: usize) -> Gradients {
+    let at = y * plane.stride + x;
+    let values = |at: usize| -> &[u16; LANES] {
+        plane.data[at..].first_chunk().expect("planes have slack behind them")
+    };
+    let (left, right) = (values(at - 1), values(at + 1));
+    let (above, below) = (values(at - plane.stride), values(at + plane.stride));
+    let mut out = Gradients { magnitude: [0.0; LANES], direction: [0.0; LANES] };
+    for lane in 0..LANES {
+        let dx = f32::from(right[lane]) - f32::from(left[lane]);
+        let dy = f32::from(below[lane]) - f32::from(above[lane]);
+        out.magnitude[lane] = (dx * dx + dy * dy).sqrt();
+        out.direction[lane] = direction_in_eighths(dx, dy);
+    }
+    out
+}
+
+/// Rounds a number between -1000 and 1000 down (a whole number may also go to itself minus one), as a number and as
+/// an integer.
+#[inline(always)]
+fn split(value: f32) -> (f32, u32) {
+    const MAGIC: f32 = 12_582_912.0;
+    let shifted = (value - 0.5) + MAGIC;
+    (shifted - MAGIC, shifted.to_bits().wrapping_sub(MAGIC.to_bits()))
+}
+
+/// Weights of columns from `first` on: a Gaussian around `center`.
+#[inline(always)]
+fn column_weights(first: i32, center: f32, falloff: f32) -> [f32; MAX_SPAN] {
+    let mut weights = [0.0; MAX_SPAN];
+    let start = first as f32 - center;
+    for (k, weight) in weights.iter_mut().enumerate() {
+        let distance = start + k as f32;
+        let exponent = distance * distance * falloff;
+        *weight = exp_f32(if exponent < -80.0 { -80.0 } else { exponent });
+    }
+    weights
+}
+
+/// The rows or columns within `radius` of a place that have neighbours on both sides.
+#[inline(always)]
+fn range(center: f32, radius: f32, len: usize) -> (i32, i32) {
+    let low = (center - radius).max(0.0) as i32;
+    let high = (center + radius) as i32 + 1;
+    (low.max(1), high.min(len as i32 - 2))
+}
+
+#[inline(always)]
+fn gather_orientations_body(place: &Place<'_>, histogram: &mut [f32; ORIENTATION_BINS]) {
+    let Place { plane, x, y, sigma } = *place;
+    let radius = 4.5 * sigma;
+    let falloff = -0.5 / (2.25 * sigma * sigma);
+    let (first_column, _) = range(x, radius, plane.size.width);
+    let (first_row, last_row) = range(y, radius, plane.size.height);
+    let weights = column_weights(first_column, x, falloff);
+    // Two rounds: directions are offset by one round less half a bin.
+    let mut rounds = [0.0_f32; 2 * ORIENTATION_BINS + 2];
+    for row in first_row..=last_row {
+        let dy = row as f32 - y;
+        let chord = radius * radius - dy * dy;
+        if chord < 0.0 {
+            continue;
+        }
+        let (low, high) = range(x, chord.sqrt(), plane.size.width);
+        let row_weight = exp_f32(dy * dy * falloff);
+        let mut column = low.max(first_column);
+        while column <= high {
+            let gradients = gradients(plane, column as usize, row as usize);
+            let offset = (column - first_column) as usize;
+            let column_weights: &[f32; LANES] =
+                weights[offset.min(MAX_SPAN - LANES)..].first_chunk().expect("in range");
+            let (mut bins, mut near, mut far) = ([0_u32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
+            for lane in 0..LANES {
+                let bin = gradients.direction[lane].mul_add(ORIENTATION_BINS as f32 / 8.0, 35.5);
+                let (whole, index) = split(bin);
+                let weight = gradients.magnitude[lane] * (column_weights[lane] * row_weight);
+                far[lane] = (bin - whole) * weight;
+                near[lane] = weight - far[lane];
+                bins[lane] = index;
+            }
+            let count = ((high - column + 1) as usize).min(LANES);
+            for lane in 0..count {
+                let bin = (bins[lane] as usize).min(2 * ORIENTATION_BINS);
+                rounds[bin] += near[lane];
+                rounds[bin + 1] += far[lane];
+            }
+            column += LANES as i32;
+        }
+    }
+    for (k, value) in rounds.iter().enumerate() {
+        histogram[k % ORIENTATION_BINS] += value;
+    }
+}
+
+/// Half a descriptor's window with its rim, in cells.
+const REACH: f32 = 2.5;
+
+/// The part of a row, as offsets from the place, that lies in a descriptor's window.
+#[inline(always)]
+fn chord(frame: &Frame, dy: f32) -> (f32, f32) {
+    let (mut low, mut high) = (-1e4_f32, 1e4_f32);
+    for (along, across) in [(frame.cosine, frame.sine * dy), (-frame.sine, frame.cosine * dy)] {
+        if along.abs() > 1e-6 {
+            let (a, b) = ((-REACH - across) / along, (REACH - across) / along);
+            low = low.max(a.min(b));
+            high = high.min(a.max(b));
+        } else if across.abs() > REACH {
+            high = low - 1.0;
+        }
+    }
+    (low, high)
+}
+
+#[inline(always)]
+fn gather_descriptor_body(place: &Place<'_>, frame: &Frame, histogram: &mut [f32; ROOMY_LEN]) {
+    let Place { plane, x, y, .. } = *place;
+    // Per cell squared: a Gaussian of two cells.
+    let falloff = -0.125 * (frame.cosine * frame.cosine + frame.sine * frame.sine);
+    let radius = REACH * (frame.cosine.abs() + frame.sine.abs())
+        / (frame.cosine * frame.cosine + frame.sine * frame.sine);
+    let (first_column, last_column) = range(x, radius, plane.size.width);
+    let (first_row, last_row) = range(y, radius, plane.size.height);
+    let weights = column_weights(first_column, x, falloff);
+    for row in first_row..=last_row {
+        let dy = row as f32 - y;
+        let (low, high) = chord(frame, dy);
+        let low = ((x + low).max(0.0) as i32).max(first_column);
+        let high = ((x + high).min(1e6) as i32 + 1).min(last_column);
+        let row_weight = exp_f32((dy * dy * falloff).max(-80.0));
+        let mut column = low;
+        while column <= high {
+            let offset = ((column - first_column) as usize).min(MAX_SPAN - LANES);
+            let column_weights: &[f32; LANES] = weights[offset..].first_chunk().expect("in range");
+            let gradients = gradients(plane, column as usize, row as usize);
+            let samples =
+                Samples::new(&gradients, frame, (column as f32 - x, dy), (column_weights, row_weight));
+            samples.scatter(((high - column + 1) as usize).min(LANES), histogram);
+            column += LANES as i32;
+        }
+    }
+}
+
+/// Where gradients fall in a descriptor's histogram.
+struct Samples {
+    index: [u32; LANES],
+    weight: [f32; LANES],
+    across: [f32; LANES],
+    down: [f32; LANES],
+    around: [f32; LANES],
+}
+
+impl Samples {
+    #[inline(always)]
+    fn new(
+        gradients: &Gradients,
+        frame: &Frame,
+        (dx, dy): (f32, f32),
+        (column_weights, row_weight): (&[f32; LANES], f32),
+    ) -> Self {
+        let zeros = [0.0_f32; LANES];
+        let mut out = Self { index: [0; LANES], weight: zeros, across: zeros, down: zeros, around: zeros };
+        // From the middle of the window to the rim's first cell.
+        const SHIFT: f32 = (RIMMED_CELLS as f32 - 1.0) / 2.0;
+        const LAST: f32 = RIMMED_CELLS as f32 - 1.001;
+        for lane in 0..LANES {
+            let dx = dx + lane as f32;
+            let column = frame.cosine.mul_add(dx, frame.sine * dy) + SHIFT;
+            let row = frame.cosine.mul_add(dy, -(frame.sine * dx)) + SHIFT;
+            let inside = (column > 0.0) & (column < LAST) & (row > 0.0) & (row < LAST);
+            let (column, row) = if inside { (column, row) } else { (1.0, 1.0) };
+            let turn = gradients.direction[lane] - frame.eighths;
+            let turn = if turn < 0.0 { turn + 8.0 } else { turn };
+            let (column_whole, column_index) = split(column);
+            let (row_whole, row_index) = split(row);
+            let (turn_whole, turn_index) = split(turn);
+            let weight = gradients.magnitude[lane] * (column_weights[lane] * row_weight);
+            out.weight[lane] = if inside { weight } else { 0.0 };
+            out.across[lane] = column - column_whole;
+            out.down[lane] = row - row_whole;
+            out.around[lane] = turn - turn_whole;
+            let cell = row_index.wrapping_mul(RIMMED_CELLS as u32).wrapping_add(column_index);
+            out.index[lane] = cell.wrapping_mul(ROOMY_DIRECTIONS as u32).wrapping_add(turn_index);
+        }
+        out
+    }
+
+    #[inline(always)]
+    fn scatter(&self, count: usize, histogram: &mut [f32; ROOMY_LEN]) {
+        const DOWN: usize = RIMMED_CELLS * ROOMY_DIRECTIONS;
+        const SPAN: usize = DOWN + ROOMY_DIRECTIONS + 2;
+        for lane in 0..count {
+            let at = (self.index[lane] as usize).min(ROOMY_LEN - SPAN);
+            let target: &mut [f32; SPAN] = histogram[at..].first_chunk_mut().expect("in range");
+            let below = self.weight[lane] * self.down[lane];
+            for (start, weight) in [(0, self.weight[lane] - below), (DOWN, below)] {
+                let right = weight * self.across[lane];
+                for (start, weight) in [(start, weight - right), (start + ROOMY_DIRECTIONS, right)] {
+                    let next = weight * self.around[lane];
+                    target[start] += weight - next;
+                    target[start + 1] += next;
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,78 @@
+//! Options of feature extraction.
+
+use serde::{Deserialize, Serialize};
+
+use crate::FrontendError;
+
+/// Where the scale space starts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FirstOctave {
+    /// Octave −1: at twice the photograph's resolution. Finds the finest blobs, at about four times the work.
+    Doubled,
+    /// Octave 0: at the photograph's resolution.
+    Original,
+}
+
+/// Options of [`super::extract`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SiftOptions {
+    /// The most features of a photograph. Range: above 0. Default 8,192: COLMAP's.
+    pub max_features: u32,
+    /// Where the scale space starts.
+    pub first_octave: FirstOctave,
+    /// The most octaves. Range: 1 to 12. Default 5.
+    pub num_octaves: u32,
+    /// The least height of an extremum of the differences of Gaussians, as a part of white. Range: 0 to 1. Default
+    /// 0.02 / 3: COLMAP's.
+    pub contrast_threshold: f64,
+    /// The largest ratio of principal curvatures of an extremum; beyond it lies on an edge. Range: above 1. Default 10
+    /// (Lowe 2004).
+    pub edge_threshold: f64,
+    /// The most orientations of a blob. Range: 1 to 4. Default 2: COLMAP's.
+    pub max_orientations: u32,
+    /// Whether features take the photograph's own axes instead of dominant gradients. Default: no.
+    pub upright: bool,
+    /// The part of `max_features` that is spread evenly over the photograph; the rest goes to the strongest. Range: 0 to
+    /// 1. Default 0.5.
+    pub spread: f64,
+}
+
+impl Default for SiftOptions {
+    fn default() -> Self {
+        Self {
+            max_features: 8192,
+            first_octave: FirstOctave::Original,
+            num_octaves: 5,
+            contrast_threshold: 0.02 / 3.0,
+            edge_threshold: 10.0,
+            max_orientations: 2,
+            upright: false,
+            spread: 0.5,
+        }
+    }
+}
+
+impl SiftOptions {
+    /// Checks the ranges of all fields.
+    ///
+    /// # Errors
+    /// Names every field that is out of its range.
+    pub fn validate(&self) -> Result<(), FrontendError> {
+        let checks = [
+            (self.max_features > 0, "max_features must be above 0"),
+            ((1..=12).contains(&self.num_octaves), "num_octaves must be 1 to 12"),
+            ((0.0..=1.0).contains(&self.contrast_threshold), "contrast_threshold must be 0 to 1"),
+            (self.edge_threshold > 1.0, "edge_threshold must be above 1"),
+            ((1..=4).contains(&self.max_orientations), "max_orientations must be 1 to 4"),
+            ((0.0..=1.0).contains(&self.spread), "spread must be 0 to 1"),
+        ];
+        let problems: Vec<&str> =
+            checks.into_iter().filter(|(holds, _)| !holds).map(|(_, what)| what).collect();
+        match problems.is_empty() {
+            true => Ok(()),
+            false => Err(FrontendError::invalid_option(format!("sift: {}", problems.join("; ")))),
+        }
+    }
+}
