@@ -6,7 +6,11 @@
 pub mod absolute_pose;
 pub mod alignment;
 pub mod camera;
+mod epipolar;
+pub mod essential;
+pub mod fundamental;
 pub mod geodesy;
+pub mod homography;
 mod linear;
 pub mod p3p;
 mod polynomial;
@@ -18,6 +22,8 @@ pub mod small_lm;
 pub mod so3;
 #[cfg(test)]
 mod test_support;
+pub mod triangulation;
+pub mod two_view;
 
 pub use camera::{Camera, CameraModel};
 pub use ransac::{RansacOptions, Robust};

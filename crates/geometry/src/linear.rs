@@ -182,6 +182,11 @@ pub(crate) fn proper_svd3(a: &Matrix3<f64>) -> Option<(Matrix3<f64>, Vector3<f64
     })
 }
 
+/// Column-major index of the entry largest in size; the first of equals.
+pub(crate) fn largest_entry(m: &Matrix3<f64>) -> usize {
+    (1..9).fold(0, |best, i| if m[i].abs() > m[best].abs() { i } else { best })
+}
+
 /// Two unit vectors that complete `direction` to an orthogonal frame.
 pub(crate) fn tangent_basis(direction: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
     let helper = if direction.x.abs() < 0.6 * direction.norm() { Vector3::x() } else { Vector3::y() };

@@ -8,7 +8,7 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use smallvec::SmallVec;
 
 use crate::Rigid3;
-use crate::linear::tangent_basis;
+use crate::linear::{largest_entry, tangent_basis};
 use crate::polynomial::cubic_roots;
 
 /// Every `cam_from_world` (at most four) under which the unit `rays` in the camera's frame see the points.
@@ -170,7 +170,8 @@ fn lines(conic: &Matrix3<f64>) -> Option<[Vector3<f64>; 2]> {
         return None;
     }
     let product = conic + crate::so3::skew(&meeting);
-    let (row, column) = largest_entry(&product);
+    let largest = largest_entry(&product);
+    let (row, column) = (largest % 3, largest / 3);
     let (l, m) = (product.row(row).transpose(), product.column(column).into_owned());
     Some([l.try_normalize(0.0)?, m.try_normalize(0.0)?])
 }
@@ -192,13 +193,6 @@ fn meet(line: &Vector3<f64>, conic: &Matrix3<f64>) -> [Option<Vector3<f64>>; 2] 
 /// The index of the smallest entry, sign included.
 fn smallest_entry(v: &Vector3<f64>) -> usize {
     (1..3).fold(0, |best, i| if v[i] < v[best] { i } else { best })
-}
-
-/// Row and column of the entry largest in size.
-fn largest_entry(m: &Matrix3<f64>) -> (usize, usize) {
-    let larger = |best: usize, i: usize| if m[i].abs() > m[best].abs() { i } else { best };
-    let index = (1..9).fold(0, larger);
-    (index % 3, index / 3)
 }
 
 #[cfg(test)]
