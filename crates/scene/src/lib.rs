@@ -2,6 +2,8 @@
 //!
 //! This crate knows what things are and how they are written down. It solves nothing and schedules nothing.
 
+pub mod codec;
+mod error;
 mod features;
 mod ids;
 mod image;
@@ -9,6 +11,7 @@ mod pair;
 mod reconstruction;
 mod submap;
 
+pub use error::SceneError;
 pub use features::{DESCRIPTOR_LEN, Features, Keypoint};
 pub use ids::{CameraId, ClusterId, ComponentId, ImageId, PointIndex};
 pub use image::{CameraRecord, FocalSource, GpsPrior, ImageRecord, ImageTable, Orientation, RejectedImage};
