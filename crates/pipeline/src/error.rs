@@ -49,9 +49,12 @@ impl PipelineError {
 
     /// An error of the operating system about `what`, with the remedy for those that have one.
     pub(crate) fn io(what: &str, error: &std::io::Error) -> Self {
-        let full = matches!(error.kind(), std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded);
-        let denied =
-            matches!(error.kind(), std::io::ErrorKind::PermissionDenied | std::io::ErrorKind::ReadOnlyFilesystem);
+        let full =
+            matches!(error.kind(), std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded);
+        let denied = matches!(
+            error.kind(),
+            std::io::ErrorKind::PermissionDenied | std::io::ErrorKind::ReadOnlyFilesystem
+        );
         let remedy = match (full, denied) {
             (true, _) => ": free space or choose another folder, then run again to resume",
             (_, true) => ": check the permissions of the folder or choose another one",

@@ -53,7 +53,8 @@ impl FromStr for ArtefactKey {
     type Err = PipelineError;
 
     fn from_str(text: &str) -> Result<Self, PipelineError> {
-        let bad = || PipelineError::invalid_input(format!("`{text}` is no artefact key: expected stage/hash"));
+        let bad =
+            || PipelineError::invalid_input(format!("`{text}` is no artefact key: expected stage/hash"));
         let (stage, digits) = text.split_once('/').ok_or_else(bad)?;
         let stage = Stage::from_name(stage).ok_or_else(bad)?;
         if digits.len() != 64 || !digits.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b)) {
@@ -112,8 +113,9 @@ impl KeyBuilder {
     /// # Errors
     /// When the value can't be written as JSON: a bug of its type.
     pub fn value<T: Serialize + ?Sized>(self, value: &T) -> Result<Self, PipelineError> {
-        let json = serde_json::to_vec(value)
-            .map_err(|error| PipelineError::bug(format!("the options of {} can't be encoded: {error}", self.stage)))?;
+        let json = serde_json::to_vec(value).map_err(|error| {
+            PipelineError::bug(format!("the options of {} can't be encoded: {error}", self.stage))
+        })?;
         Ok(self.bytes(&json))
     }
 
@@ -136,7 +138,11 @@ impl KeyBuilder {
 /// Bytes in hexadecimal, lower case.
 pub(crate) fn hex(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 16] = b"0123456789abcdef";
-    bytes.iter().flat_map(|b| [DIGITS[usize::from(b >> 4)], DIGITS[usize::from(b & 15)]]).map(char::from).collect()
+    bytes
+        .iter()
+        .flat_map(|b| [DIGITS[usize::from(b >> 4)], DIGITS[usize::from(b & 15)]])
+        .map(char::from)
+        .collect()
 }
 
 #[cfg(test)]

@@ -33,7 +33,10 @@ impl SceneError {
     }
 
     /// The place that the bytes come from or go to failed.
-    pub(crate) fn source_failed(what: &str, source: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> Self {
+    pub(crate) fn source_failed(
+        what: &str,
+        source: impl Into<Box<dyn std::error::Error + Send + Sync>>,
+    ) -> Self {
         Self(Box::new(Inner::Source { what: what.to_owned(), source: source.into() }))
     }
 

@@ -3,11 +3,15 @@
 //! This crate knows what things are and how they are written down. It solves nothing and schedules nothing.
 
 pub mod codec;
+pub mod colmap;
 mod error;
 mod features;
 mod ids;
 mod image;
+mod model;
 mod pair;
+pub mod ply;
+pub mod positions;
 mod reconstruction;
 mod submap;
 
@@ -15,6 +19,7 @@ pub use error::SceneError;
 pub use features::{DESCRIPTOR_LEN, Features, Keypoint};
 pub use ids::{CameraId, ClusterId, ComponentId, ImageId, PointIndex};
 pub use image::{CameraRecord, FocalSource, GpsPrior, ImageRecord, ImageTable, Orientation, RejectedImage};
+pub use model::Model;
 pub use pair::{ImagePair, MatchedPair, PairKind, PairSummary};
 pub use reconstruction::{Observation, Reconstruction, RegisteredImage, ScenePoint};
 pub use submap::{ImageFate, Submap, SubmapOutcome};

@@ -9,12 +9,14 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use futures::TryStreamExt;
-use futures::executor::block_on;
 use object_store::local::LocalFileSystem;
 use object_store::memory::InMemory;
 use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions, PutPayload};
 
 use crate::{ArtefactKey, PipelineError, Stage};
+
+mod wait;
+use wait::block_on;
 
 /// What became of a write.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,10 +63,12 @@ impl Store {
     /// # Errors
     /// When the folder can't be made.
     pub fn local(folder: &Path) -> Result<Self, PipelineError> {
-        std::fs::create_dir_all(folder)
-            .map_err(|error| PipelineError::io(&format!("store folder {} can't be made", folder.display()), &error))?;
-        let inner = LocalFileSystem::new_with_prefix(folder)
-            .map_err(|error| storage(&format!("store folder {} can't be opened", folder.display()), &error))?;
+        std::fs::create_dir_all(folder).map_err(|error| {
+            PipelineError::io(&format!("store folder {} can't be made", folder.display()), &error)
+        })?;
+        let inner = LocalFileSystem::new_with_prefix(folder).map_err(|error| {
+            storage(&format!("store folder {} can't be opened", folder.display()), &error)
+        })?;
         Ok(Self { inner: Arc::new(inner), place: folder.display().to_string().into() })
     }
 

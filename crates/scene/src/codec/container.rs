@@ -144,7 +144,8 @@ impl ArchiveWriter {
         let packed = match packing {
             Packing::Raw => None,
             Packing::Zstd => Some(
-                zstd::bulk::compress(bytes, ZSTD_LEVEL).map_err(|error| SceneError::source_failed("zstd", error))?,
+                zstd::bulk::compress(bytes, ZSTD_LEVEL)
+                    .map_err(|error| SceneError::source_failed("zstd", error))?,
             ),
         };
         let packed =
@@ -171,8 +172,9 @@ impl ArchiveWriter {
     /// # Errors
     /// When the value can't be written as JSON.
     pub fn json<T: Serialize + ?Sized>(&mut self, tag: Tag, item: u32, value: &T) -> Result<(), SceneError> {
-        let bytes = serde_json::to_vec(value)
-            .map_err(|error| SceneError::invalid(format!("section {tag} can't be written as JSON: {error}")))?;
+        let bytes = serde_json::to_vec(value).map_err(|error| {
+            SceneError::invalid(format!("section {tag} can't be written as JSON: {error}"))
+        })?;
         self.column(tag, item, &bytes, Packing::Zstd)
     }
 
@@ -256,7 +258,8 @@ impl<S: Source> Archive<S> {
         if len < HEADER_LEN {
             return Err(SceneError::corrupt(format!("{len} bytes are too few for an artefact")));
         }
-        let header: Header = bytemuck::pod_read_unaligned(read_one(&source, 0..HEADER_LEN)?.as_ref().as_ref());
+        let header: Header =
+            bytemuck::pod_read_unaligned(read_one(&source, 0..HEADER_LEN)?.as_ref().as_ref());
         check_header(&header, len, kind)?;
         let table_end = pad(HEADER_LEN + u64::from(header.num_sections) * ENTRY_LEN);
         if table_end > len {
@@ -313,10 +316,18 @@ impl<S: Source> Archive<S> {
     /// # Errors
     /// As [`Archive::column`].
     pub fn columns<T: Pod>(&self, wanted: &[(Tag, u32)]) -> Result<Vec<Vec<T>>, SceneError> {
-        let entries = wanted.iter().map(|&(tag, item)| self.required(tag, item)).collect::<Result<Vec<_>, _>>()?;
+        let entries =
+            wanted.iter().map(|&(tag, item)| self.required(tag, item)).collect::<Result<Vec<_>, _>>()?;
         let ranges: Vec<Range<u64>> = entries.iter().map(|entry| entry.range()).collect();
-        let parts = self.source.read(&ranges).map_err(|error| SceneError::source_failed("reading sections", error))?;
-        entries.into_iter().zip(&parts).map(|(entry, stored)| unpack::<T>(entry, stored.as_ref().as_ref())).collect()
+        let parts = self
+            .source
+            .read(&ranges)
+            .map_err(|error| SceneError::source_failed("reading sections", error))?;
+        entries
+            .into_iter()
+            .zip(&parts)
+            .map(|(entry, stored)| unpack::<T>(entry, stored.as_ref().as_ref()))
+            .collect()
     }
 
     /// Reads a record.
@@ -325,8 +336,9 @@ impl<S: Source> Archive<S> {
     /// As [`Archive::column`], and when the JSON is not of this type.
     pub fn json<T: DeserializeOwned>(&self, tag: Tag, item: u32) -> Result<T, SceneError> {
         let bytes = self.column::<u8>(tag, item)?;
-        serde_json::from_slice(&bytes)
-            .map_err(|error| SceneError::corrupt(format!("section {tag}/{item} is not what it should be: {error}")))
+        serde_json::from_slice(&bytes).map_err(|error| {
+            SceneError::corrupt(format!("section {tag}/{item} is not what it should be: {error}"))
+        })
     }
 
     fn entry(&self, tag: Tag, item: u32) -> Option<&Entry> {
@@ -339,10 +351,14 @@ impl<S: Source> Archive<S> {
     }
 }
 
-fn read_one<'a, S: Source>(source: &'a S, range: Range<u64>) -> Result<Box<dyn AsRef<[u8]> + 'a>, SceneError> {
+fn read_one<'a, S: Source>(
+    source: &'a S,
+    range: Range<u64>,
+) -> Result<Box<dyn AsRef<[u8]> + 'a>, SceneError> {
     let wanted = range.end - range.start;
-    let mut parts =
-        source.read(&[range]).map_err(|error| SceneError::source_failed("reading an artefact's header", error))?;
+    let mut parts = source
+        .read(&[range])
+        .map_err(|error| SceneError::source_failed("reading an artefact's header", error))?;
     match parts.pop() {
         Some(part) if part.as_ref().as_ref().len() as u64 == wanted => Ok(part),
         _ => Err(SceneError::corrupt("fewer bytes were read than the artefact has")),
@@ -363,10 +379,16 @@ fn check_header(header: &Header, len: u64, kind: Kind) -> Result<(), SceneError>
         )));
     }
     if header.kind != kind as u16 {
-        return Err(SceneError::unsupported(format!("the artefact is of kind {}, not {kind:?}", header.kind)));
+        return Err(SceneError::unsupported(format!(
+            "the artefact is of kind {}, not {kind:?}",
+            header.kind
+        )));
     }
     if header.len != len {
-        return Err(SceneError::corrupt(format!("the artefact has {len} bytes and should have {}", header.len)));
+        return Err(SceneError::corrupt(format!(
+            "the artefact has {len} bytes and should have {}",
+            header.len
+        )));
     }
     if header.num_sections > MAX_SECTIONS {
         return Err(SceneError::corrupt(format!("{} sections are too many", header.num_sections)));

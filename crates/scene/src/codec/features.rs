@@ -40,11 +40,15 @@ impl FeatureBatchWriter {
     pub fn push(&mut self, features: &Result<Features, String>) -> Result<(), SceneError> {
         let item = self.outcomes.len() as u32;
         match features {
-            Err(reason) => self.outcomes.push(FeatureOutcome { num_features: 0, rejected: Some(reason.clone()) }),
+            Err(reason) => {
+                self.outcomes.push(FeatureOutcome { num_features: 0, rejected: Some(reason.clone()) })
+            }
             Ok(features) => {
                 let count = features.len();
                 if features.colors.len() != count || features.descriptors.len() != count * DESCRIPTOR_LEN {
-                    return Err(SceneError::invalid(format!("features of image {item} have columns of unequal length")));
+                    return Err(SceneError::invalid(format!(
+                        "features of image {item} have columns of unequal length"
+                    )));
                 }
                 self.archive.column(KEYPOINTS, item, &features.keypoints, Packing::Raw)?;
                 self.archive.column(COLORS, item, &features.colors, Packing::Raw)?;
@@ -98,7 +102,9 @@ impl<S: Source> FeatureBatchReader<S> {
         let (keypoints, colors) = self.keypoints_and_colors(place)?;
         let descriptors = self.archive.column(DESCRIPTORS, place as u32)?;
         if descriptors.len() != keypoints.len() * DESCRIPTOR_LEN {
-            return Err(SceneError::corrupt(format!("image {place} of the batch has columns of unequal length")));
+            return Err(SceneError::corrupt(format!(
+                "image {place} of the batch has columns of unequal length"
+            )));
         }
         Ok(Features { keypoints, descriptors, colors })
     }
@@ -114,7 +120,9 @@ impl<S: Source> FeatureBatchReader<S> {
         let keypoints: Vec<Keypoint> = self.archive.column(KEYPOINTS, place as u32)?;
         let colors: Vec<[u8; 3]> = self.archive.column(COLORS, place as u32)?;
         if colors.len() != keypoints.len() {
-            return Err(SceneError::corrupt(format!("image {place} of the batch has columns of unequal length")));
+            return Err(SceneError::corrupt(format!(
+                "image {place} of the batch has columns of unequal length"
+            )));
         }
         Ok((keypoints, colors))
     }

@@ -123,5 +123,9 @@ pub fn read_matches(
         }
     }
     let columns = archive.columns::<[u32; 2]>(&sections)?;
-    Ok(summaries.into_iter().zip(columns).map(|(summary, matches)| MatchedPair { summary, matches }).collect())
+    Ok(summaries
+        .into_iter()
+        .zip(columns)
+        .map(|(summary, matches)| MatchedPair { summary, matches })
+        .collect())
 }

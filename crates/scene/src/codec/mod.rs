@@ -11,5 +11,7 @@ pub use container::{Archive, ArchiveWriter, Kind, Packing, Source, Tag};
 pub use features::{FeatureBatchReader, FeatureBatchWriter, FeatureOutcome};
 pub use matches::{MatchBlock, encode_match_block, read_matches, read_pair_summaries};
 pub use pairs::{decode_pair_blocks, encode_pair_blocks};
-pub use reconstruction::{decode_reconstruction, encode_reconstruction, read_reconstruction, write_reconstruction};
-pub use submap::{decode_submap, encode_submap};
+pub use reconstruction::{
+    decode_reconstruction, encode_reconstruction, read_reconstruction, write_reconstruction,
+};
+pub use submap::{decode_submap, encode_submap, read_submap_report};

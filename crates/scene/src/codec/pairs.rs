@@ -28,7 +28,9 @@ pub fn encode_pair_blocks<T: Serialize>(blocks: &[Vec<ImagePair>], info: &T) -> 
 ///
 /// # Errors
 /// As [`Archive::open`].
-pub fn decode_pair_blocks<T: DeserializeOwned>(source: impl Source) -> Result<(Vec<Vec<ImagePair>>, T), SceneError> {
+pub fn decode_pair_blocks<T: DeserializeOwned>(
+    source: impl Source,
+) -> Result<(Vec<Vec<ImagePair>>, T), SceneError> {
     let archive = Archive::open(source, Kind::Pairs)?;
     let rows = archive.column::<[u32; 2]>(PAIRS, 0)?;
     let lengths = archive.column::<u32>(LENGTHS, 0)?;

@@ -6,7 +6,7 @@ use terrane_geometry::camera::MAX_PARAMS;
 use terrane_geometry::{Camera, CameraModel, Rigid3};
 
 use super::{Archive, ArchiveWriter, Kind, Packing, Source, Tag};
-use crate::{CameraId, ImageId, Observation, Reconstruction, RegisteredImage, ScenePoint, SceneError};
+use crate::{CameraId, ImageId, Observation, Reconstruction, RegisteredImage, SceneError, ScenePoint};
 
 const CAMERAS: Tag = Tag(*b"CAMS");
 const IMAGES: Tag = Tag(*b"IMGS");

@@ -1,0 +1,101 @@
+//! Execution: one task in, one artefact out.
+
+pub(crate) mod read;
+
+use std::panic::AssertUnwindSafe;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use terrane_scene::SceneError;
+
+use crate::{PipelineError, Put, RunConfig, Store, Task, TaskError, TaskReport};
+
+/// Tells tasks to stop. Clones share the signal.
+#[derive(Clone, Debug, Default)]
+pub struct Cancel(Arc<AtomicBool>);
+
+impl Cancel {
+    /// Asks every task of this signal to stop at its next safe point.
+    pub fn cancel(&self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether it was asked.
+    pub fn is_cancelled(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+
+    pub(crate) fn check(&self) -> Result<(), PipelineError> {
+        if self.is_cancelled() { Err(PipelineError::cancelled()) } else { Ok(()) }
+    }
+}
+
+/// What a worker has, the same for every task of a run.
+pub struct ExecutionContext {
+    /// The run.
+    pub config: RunConfig,
+    /// The signal to stop.
+    pub cancel: Cancel,
+    pool: rayon::ThreadPool,
+}
+
+impl ExecutionContext {
+    /// A context with a thread pool of `config.workers.threads` threads.
+    ///
+    /// # Errors
+    /// Invalid input when options are out of range; storage when threads can't be had.
+    pub fn new(config: RunConfig, cancel: Cancel) -> Result<Self, PipelineError> {
+        let problems = config.validate();
+        if !problems.is_empty() {
+            return Err(PipelineError::invalid_input(problems.join("; ")));
+        }
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(config.workers.threads as usize)
+            .thread_name(|at| format!("compute-{at}"))
+            .build()
+            .map_err(|error| {
+                PipelineError::storage(format!("threads for computing can't be had: {error}"))
+            })?;
+        Ok(Self { config, cancel, pool })
+    }
+}
+
+/// What a stage made: the bytes of its artefact, and figures for the report.
+pub(crate) struct Made {
+    pub bytes: Vec<u8>,
+    pub counts: Vec<(&'static str, u64)>,
+}
+
+/// A value that can't be written in its own format is a bug of its maker.
+pub(crate) fn encode_error(error: SceneError) -> PipelineError {
+    PipelineError::bug(format!("an artefact can't be encoded: {error}"))
+}
+
+/// Runs a task on the context's threads and leaves its artefact in the store. Blocks until it is done: to be called from
+/// a thread that drives no asynchronous runtime.
+///
+/// # Errors
+/// Retryable ones and others, see [`TaskError`]; a task that stops on a broken invariant is an error, never a panic.
+pub fn execute(task: &Task, store: &Store, context: &ExecutionContext) -> Result<TaskReport, TaskError> {
+    let run = || -> Result<TaskReport, PipelineError> {
+        context.cancel.check()?;
+        let made = run_stage(task, store, context)?;
+        context.cancel.check()?;
+        let bytes_written = made.bytes.len() as u64;
+        let put = store.put_if_absent(&task.key.path(), made.bytes)?;
+        let counts = made.counts.into_iter().map(|(name, count)| (name.to_owned(), count)).collect();
+        Ok(TaskReport { bytes_written, existed: put == Put::Existed, counts })
+    };
+    match std::panic::catch_unwind(AssertUnwindSafe(|| context.pool.install(run))) {
+        Ok(done) => done.map_err(TaskError::from),
+        Err(panic) => {
+            let message = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+            let message = message.or_else(|| panic.downcast_ref::<String>().cloned());
+            Err(TaskError::panicked(message.unwrap_or_else(|| "no message".to_owned())))
+        }
+    }
+}
+
+fn run_stage(task: &Task, _: &Store, _: &ExecutionContext) -> Result<Made, PipelineError> {
+    Err(PipelineError::invalid_input(format!("{} is not a stage of this build", task.stage)))
+}
