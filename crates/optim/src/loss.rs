@@ -38,7 +38,8 @@ impl Loss {
             }
             Self::SoftL1 => {
                 let root = (1.0 + s / (scale * scale)).sqrt();
-                (2.0 * scale * scale * (root - 1.0), 1.0 / root)
+                // 2 a² (root − 1), without cancellation.
+                (2.0 * s / (root + 1.0), 1.0 / root)
             }
             Self::Cauchy => {
                 let ratio = s / (scale * scale);

@@ -7,15 +7,24 @@
 //! Observations whose point starts behind the camera take no part in the solve. A step that would carry a point behind
 //! a camera is shortened for this point; if that does not help it counts as no descent.
 
+mod layout;
+mod linearisation;
 mod options;
+mod pattern;
+mod plan;
 mod problem;
+mod reduced;
 mod report;
+mod schur;
 mod shards;
+mod solver;
+mod step;
 
 pub use options::{BundleOptions, Gauge};
 pub use problem::{BundleProblem, FocalPrior, PositionPrior, RefineIntrinsics};
 pub use report::{BundleReport, Termination};
 pub use shards::{BundleObservation, BundleShard, InMemoryShards, ShardError, Shards};
+pub use solver::solve;
 
 /// A problem that can't be solved as given; says what to change.
 #[derive(Debug, thiserror::Error)]
@@ -54,3 +63,6 @@ impl From<crate::linear::LinearError> for BundleError {
         BundleErrorKind::Linear(error).into()
     }
 }
+
+#[cfg(test)]
+mod tests;

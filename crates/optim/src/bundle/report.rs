@@ -53,3 +53,21 @@ pub struct BundleReport {
     /// Number of unknowns of the reduced camera system.
     pub reduced_unknowns: u64,
 }
+
+impl BundleReport {
+    pub(super) fn empty() -> Self {
+        Self {
+            initial_cost: 0.0,
+            final_cost: 0.0,
+            iterations: 0,
+            accepted_steps: 0,
+            termination: Termination::NothingToAdjust,
+            observations: 0,
+            behind_camera: 0,
+            seen_once: 0,
+            points: 0,
+            unconstrained_poses: Vec::new(),
+            reduced_unknowns: 0,
+        }
+    }
+}

@@ -1,0 +1,202 @@
+//! Jacobians against differences, and the Schur complement against the dense normal equations of everything.
+
+use nalgebra::{DMatrix, DVector, Vector6};
+
+use super::super::layout::{Cameras, Layout};
+use super::super::linearisation::{Context, Linearisation, Terms, linearise};
+use super::super::pattern::Covisibility;
+use super::super::plan::{Dropped, ShardPlan};
+use super::super::reduced::Reduced;
+use super::super::step::{CameraStep, try_step};
+use super::*;
+
+struct Setup {
+    problem: BundleProblem,
+    shard: BundleShard,
+    layout: Layout,
+    cameras: Cameras,
+    plan: ShardPlan,
+}
+
+fn setup(model: CameraModel, num_intrinsics: usize, columns: usize) -> Setup {
+    let options = SceneOptions {
+        columns,
+        rows: 2,
+        points: 40 + 2 * columns,
+        model,
+        num_intrinsics,
+        ..Default::default()
+    };
+    let scene = Scene::new(options);
+    let (mut problem, mut shard) = scene.disturbed(3);
+    problem.fixed_poses[2] = true;
+    problem.position_priors.push(PositionPrior {
+        pose: 1,
+        center_in_world: Vector3::new(1.0, 2.0, 9.0),
+        sigma_m: Vector3::new(0.5, 0.6, 0.7),
+    });
+    problem.focal_priors.push(FocalPrior { intrinsics: 0, focal_px: 870.0, sigma_px: 3.0 });
+    // A point that a pose sees twice.
+    let twice = shard.observations[0];
+    shard
+        .observations
+        .insert(0, BundleObservation { xy_px: [twice.xy_px[0] + 2.0, twice.xy_px[1] - 1.0], ..twice });
+    let cameras = Cameras::new(problem.poses.clone(), problem.intrinsics.clone());
+    let plan = ShardPlan::new(&shard, &Dropped::find(&shard, &problem, &cameras), &problem);
+    let observed: Vec<bool> = (0..problem.poses.len()).map(|pose| !plan.of_pose(pose).is_empty()).collect();
+    let layout = Layout::new(&problem, &observed, None);
+    Setup { problem, shard, layout, cameras, plan }
+}
+
+impl Setup {
+    fn context(&self, loss: Loss) -> Context<'_> {
+        Context {
+            problem: &self.problem,
+            layout: &self.layout,
+            cameras: &self.cameras,
+            loss,
+            loss_scale_px: 2.0,
+            held_direction: None,
+            damping: 0.01,
+        }
+    }
+
+    /// Residuals of observations and priors after a step of cameras and points.
+    fn residuals(&self, step: &[f64]) -> Vec<f64> {
+        let n = self.layout.num_unknowns();
+        let cameras = self.cameras.stepped(&self.layout, &step[..n]).unwrap();
+        let mut residuals = Vec::new();
+        for o in &self.plan.observations {
+            let delta =
+                Vector3::from_column_slice(&step[n + 3 * o.point as usize..n + 3 * o.point as usize + 3]);
+            let x = self.shard.points[o.point as usize] + delta;
+            let camera = &cameras.intrinsics[self.problem.intrinsics_of_pose[o.pose as usize] as usize];
+            let xy = camera.project(&cameras.poses[o.pose as usize].transform_point(&x)).unwrap();
+            residuals.extend([xy.x - f64::from(o.xy_px[0]), xy.y - f64::from(o.xy_px[1])]);
+        }
+        let prior = &self.problem.position_priors[0];
+        let center = cameras.poses[prior.pose as usize].center();
+        residuals.extend((center - prior.center_in_world).component_div(&prior.sigma_m).iter());
+        let focal = &self.problem.focal_priors[0];
+        for f in &cameras.intrinsics[0].params()[..cameras.intrinsics[0].model.num_focal()] {
+            residuals.push((f - focal.focal_px) / focal.sigma_px);
+        }
+        residuals
+    }
+
+    /// The Jacobian of [`Setup::residuals`] by central differences.
+    fn jacobian(&self) -> DMatrix<f64> {
+        let n = self.layout.num_unknowns() + 3 * self.shard.points.len();
+        let columns: Vec<DVector<f64>> = (0..n)
+            .map(|i| {
+                let h = 1e-6;
+                let at = |value: f64| {
+                    let mut step = vec![0.0; n];
+                    step[i] = value;
+                    DVector::from_vec(self.residuals(&step))
+                };
+                (at(h) - at(-h)) / (2.0 * h)
+            })
+            .collect();
+        DMatrix::from_columns(&columns)
+    }
+}
+
+#[test]
+fn jacobians_agree_with_differences() {
+    for (model, n) in [(CameraModel::Pinhole, 1), (CameraModel::Radial, 0), (CameraModel::FullOpenCv, 2)] {
+        let setup = setup(model, n, 3);
+        let expected = setup.jacobian();
+        let context = setup.context(Loss::Squared);
+        let free = 6 * setup.layout.poses.len();
+        for (i, o) in setup.plan.observations.iter().enumerate() {
+            let mut terms = Terms::default();
+            let mut intrinsics = vec![0.0; 2 * setup.layout.stride];
+            linearise(&context, o, &setup.shard.points[o.point as usize], &mut terms, &mut intrinsics);
+            for row in 0..2 {
+                let mut got = DVector::zeros(expected.ncols());
+                let variable = setup.layout.pose_variable[o.pose as usize];
+                if variable != super::super::layout::NONE {
+                    let value = Vector6::from(terms.pose[row]);
+                    got.rows_mut(6 * variable as usize, 6).copy_from(&value);
+                }
+                let own = setup.layout.intrinsics_variable_of_pose[o.pose as usize] as usize;
+                let width = setup.layout.params[own].len();
+                let offset = free + setup.layout.params[..own].iter().map(Vec::len).sum::<usize>();
+                for a in 0..width {
+                    got[offset + a] = intrinsics[row * setup.layout.stride + a];
+                }
+                let at = setup.layout.num_unknowns() + 3 * o.point as usize;
+                got.rows_mut(at, 3).copy_from(&Vector3::from(terms.point[row]));
+                let expected = expected.row(2 * i + row).transpose();
+                let scale = 1.0 + expected.amax();
+                assert!((got - expected).amax() < 1e-6 * scale, "{model:?} observation {i}");
+            }
+        }
+    }
+}
+
+#[test]
+fn schur_complement_gives_the_step_of_the_dense_normal_equations() {
+    for (model, n, columns) in [
+        (CameraModel::Pinhole, 1, 3),
+        (CameraModel::Radial, 0, 3),
+        (CameraModel::FullOpenCv, 2, 3),
+        (CameraModel::SimpleRadial, 3, 31),
+    ] {
+        let setup = setup(model, n, columns);
+        let unknowns = setup.layout.num_unknowns();
+        // Weights come from the loss; damping from the diagonal.
+        let context = setup.context(Loss::Cauchy);
+        let options = BundleOptions::default();
+        let mut jacobian = setup.jacobian();
+        let mut residuals = DVector::from_vec(setup.residuals(&vec![0.0; jacobian.ncols()]));
+        for i in 0..setup.plan.observations.len() {
+            let squared = residuals[2 * i].powi(2) + residuals[2 * i + 1].powi(2);
+            let root = Loss::Cauchy.evaluate(squared, 2.0).1.sqrt();
+            jacobian.rows_mut(2 * i, 2).scale_mut(root);
+            residuals.rows_mut(2 * i, 2).scale_mut(root);
+        }
+        let mut normal = jacobian.transpose() * &jacobian;
+        let gradient = jacobian.transpose() * &residuals;
+        for i in 0..normal.nrows() {
+            normal[(i, i)] *= 1.0 + context.damping;
+        }
+        let expected = normal.clone().cholesky().unwrap().solve(&(-&gradient));
+
+        let mut covisibility = Covisibility::new(setup.problem.poses.len());
+        covisibility.add(&setup.plan);
+        let (mut rows, pattern) = covisibility.rows(&setup.layout);
+        let offsets: Vec<usize> = (0..setup.layout.intrinsics.len())
+            .map(|v| pattern.offset(setup.layout.poses.len() + v))
+            .collect();
+        let mut reduced = Reduced::new(pattern, &options).unwrap();
+        let mut shard = Linearisation::new(&setup.plan, setup.layout.stride);
+        shard.update(&context, &setup.plan, Some(&setup.shard.points));
+        super::super::schur::accumulate(&mut rows, &setup.layout, &setup.plan, &shard);
+        reduced.assemble(&context, &rows, &options);
+        let step = reduced.solve().unwrap();
+        let scale = expected.amax();
+        for i in 0..unknowns {
+            assert!(
+                (step[i] - expected[i]).abs() < 1e-5 * scale,
+                "{model:?} unknown {i}: {} {}",
+                step[i],
+                expected[i]
+            );
+        }
+
+        let next = setup.cameras.stepped(&setup.layout, &step).unwrap();
+        let camera_step = CameraStep { step: &step, cameras: &next, intrinsics_offsets: &offsets };
+        let mut trial = setup.shard.points.clone();
+        let tried = try_step(&context, &camera_step, (&setup.plan, &shard), &setup.shard.points, &mut trial);
+        for (point, (before, after)) in setup.shard.points.iter().zip(&trial).enumerate() {
+            let expected = expected.rows(unknowns + 3 * point, 3);
+            assert!((after - before - expected).amax() < 1e-5, "{model:?} point {point}");
+        }
+        let undamped = jacobian.transpose() * &jacobian;
+        let model_reduction = -gradient.dot(&expected) - 0.5 * expected.dot(&(undamped * &expected));
+        let got = tried.model_reduction + reduced.model_reduction(&step, context.damping);
+        assert!((got / model_reduction - 1.0).abs() < 1e-5, "{model:?}: {got} {model_reduction}");
+    }
+}

@@ -1,0 +1,109 @@
+//! The truth is found, as well as the noise allows and no better.
+
+use super::*;
+
+/// The expected cost of least squares: (residuals − unknowns) σ² / 2, with seven unknowns free.
+fn expected_cost(report: &BundleReport, noise_px: f64) -> f64 {
+    let freedom =
+        2.0 * report.observations as f64 - 3.0 * report.points as f64 - report.reduced_unknowns as f64 + 7.0;
+    0.5 * freedom * noise_px * noise_px
+}
+
+#[test]
+fn noisy_scene_reaches_the_cost_that_the_noise_predicts() {
+    for (model, num_intrinsics) in [
+        (CameraModel::SimplePinhole, 1),
+        (CameraModel::SimpleRadial, 1),
+        (CameraModel::Radial, 0),
+        (CameraModel::OpenCv, 2),
+    ] {
+        let scene = Scene::new(SceneOptions { model, num_intrinsics, ..Default::default() });
+        let (mut problem, shard) = scene.disturbed(3);
+        let mut shards = InMemoryShards(vec![shard]);
+        let report = solve(&mut problem, &mut shards, &BundleOptions::default()).unwrap();
+        assert!(report.termination.converged(), "{model:?}: {report:?}");
+        let expected = expected_cost(&report, 0.5);
+        assert!(
+            (report.final_cost / expected - 1.0).abs() < 0.1,
+            "{model:?}: {} for {expected}",
+            report.final_cost
+        );
+        let rmse = center_rmse(&problem.poses, &scene.truth.poses);
+        assert!((0.001..0.06).contains(&rmse), "{model:?}: {rmse}");
+    }
+}
+
+#[test]
+fn perfect_scene_is_recovered_to_the_precision_of_pixels() {
+    let scene = Scene::new(SceneOptions { noise_px: 0.0, ..Default::default() });
+    let (mut problem, shard) = scene.disturbed(3);
+    let mut shards = InMemoryShards(vec![shard]);
+    let options = BundleOptions { cost_tolerance: 1e-12, ..Default::default() };
+    let report = solve(&mut problem, &mut shards, &options).unwrap();
+    // Pixels are stored as f32: about 3e-5 px each.
+    assert!(report.final_cost < 1e-6, "{report:?}");
+    assert!(center_rmse(&problem.poses, &scene.truth.poses) < 1e-5);
+    assert!((problem.intrinsics[0].mean_focal_px() - 900.0).abs() < 1e-2);
+}
+
+#[test]
+fn outliers_under_a_robust_loss_hardly_move_the_result() {
+    let scene = Scene::new(SceneOptions { points: 600, ..Default::default() });
+    let solve_with = |outliers: bool, loss: Loss| {
+        let (mut problem, mut shard) = scene.disturbed(3);
+        let mut noise = Noise::new(11);
+        for observation in shard.observations.iter_mut().step_by(10) {
+            let xy = [noise.uniform(0.0..1000.0) as f32, noise.uniform(0.0..800.0) as f32];
+            if outliers {
+                observation.xy_px = xy;
+            }
+        }
+        let mut shards = InMemoryShards(vec![shard]);
+        let options = BundleOptions { loss, max_iterations: 100, ..Default::default() };
+        solve(&mut problem, &mut shards, &options).unwrap();
+        center_rmse(&problem.poses, &scene.truth.poses)
+    };
+    let clean = solve_with(false, Loss::Squared);
+    let robust = solve_with(true, Loss::Cauchy);
+    let fooled = solve_with(true, Loss::Squared);
+    assert!(robust < 1.5 * clean, "{robust} against {clean}");
+    assert!(fooled > 3.0 * clean, "{fooled} against {clean}");
+}
+
+#[test]
+fn position_priors_place_the_scene() {
+    let scene = Scene::new(SceneOptions::default());
+    let (mut problem, shard) = scene.disturbed(5);
+    let mut noise = Noise::new(2);
+    for (pose, truth) in scene.truth.poses.iter().enumerate() {
+        problem.position_priors.push(PositionPrior {
+            pose: pose as u32,
+            center_in_world: truth.center() + 0.02 * noise.vector(),
+            sigma_m: Vector3::repeat(0.02),
+        });
+    }
+    // One receiver was lost: the robust prior forgets it.
+    problem.position_priors[4].center_in_world.x += 30.0;
+    let mut shards = InMemoryShards(vec![shard]);
+    let options = BundleOptions { prior_loss: Loss::Cauchy, ..Default::default() };
+    let report = solve(&mut problem, &mut shards, &options).unwrap();
+    assert!(report.termination.converged());
+    let squared: f64 = problem
+        .poses
+        .iter()
+        .zip(&scene.truth.poses)
+        .map(|(found, truth)| (found.center() - truth.center()).norm_squared())
+        .sum();
+    let rmse = (squared / problem.poses.len() as f64).sqrt();
+    assert!((0.002..0.05).contains(&rmse), "{rmse}");
+}
+
+#[test]
+fn focal_prior_pulls_the_focal_length() {
+    let scene = Scene::new(SceneOptions::default());
+    let (mut problem, shard) = scene.disturbed(5);
+    problem.focal_priors = vec![FocalPrior { intrinsics: 0, focal_px: 950.0, sigma_px: 1e-3 }];
+    let mut shards = InMemoryShards(vec![shard]);
+    solve(&mut problem, &mut shards, &BundleOptions::default()).unwrap();
+    assert!((problem.intrinsics[0].mean_focal_px() - 950.0).abs() < 0.1);
+}
