@@ -98,48 +98,80 @@ fn tile(rows: &Packed<ROWS>, columns: &Packed<WIDTH>, (strip, group): (usize, us
     }
 }
 
-/// Products of bytes that are all at most 127.
+/// Products of bytes that are all at most 127. Rows are written out, so that all sums stay in registers.
 #[target_feature(enable = "avx2")]
 #[inline]
 fn dots_narrow(rows: &Block<ROWS>, columns: [&Block<WIDTH>; GROUP]) -> Tile {
-    let ones = _mm256_set1_epi16(1);
-    let mut dots = [[_mm256_setzero_si256(); GROUP]; ROWS];
+    let zero = [_mm256_setzero_si256(); GROUP];
+    let (mut dots_0, mut dots_1, mut dots_2, mut dots_3) = (zero, zero, zero, zero);
     for quad in (0..QUADS).step_by(2) {
-        for r in 0..ROWS {
-            let even = _mm256_set1_epi32(rows.0[quad][r]);
-            let odd = _mm256_set1_epi32(rows.0[quad + 1][r]);
-            for c in 0..GROUP {
-                let four = _mm256_add_epi16(
-                    _mm256_maddubs_epi16(even, load(&columns[c].0[quad])),
-                    _mm256_maddubs_epi16(odd, load(&columns[c].0[quad + 1])),
-                );
-                dots[r][c] = _mm256_add_epi32(dots[r][c], _mm256_madd_epi16(four, ones));
-            }
-        }
+        let (row_even, row_odd) = (&rows.0[quad], &rows.0[quad + 1]);
+        let even = [load(&columns[0].0[quad]), load(&columns[1].0[quad])];
+        let odd = [load(&columns[0].0[quad + 1]), load(&columns[1].0[quad + 1])];
+        dots_0 = add_narrow(dots_0, [row_even[0], row_odd[0]], even, odd);
+        dots_1 = add_narrow(dots_1, [row_even[1], row_odd[1]], even, odd);
+        dots_2 = add_narrow(dots_2, [row_even[2], row_odd[2]], even, odd);
+        dots_3 = add_narrow(dots_3, [row_even[3], row_odd[3]], even, odd);
     }
-    dots
+    [dots_0, dots_1, dots_2, dots_3]
 }
 
-/// Products of any bytes.
+#[target_feature(enable = "avx2")]
+#[inline]
+fn add_narrow(
+    dots: [__m256i; GROUP],
+    row: [i32; 2],
+    even: [__m256i; GROUP],
+    odd: [__m256i; GROUP],
+) -> [__m256i; GROUP] {
+    let (row_even, row_odd) = (_mm256_set1_epi32(row[0]), _mm256_set1_epi32(row[1]));
+    let ones = _mm256_set1_epi16(1);
+    let four_0 =
+        _mm256_add_epi16(_mm256_maddubs_epi16(row_even, even[0]), _mm256_maddubs_epi16(row_odd, odd[0]));
+    let four_1 =
+        _mm256_add_epi16(_mm256_maddubs_epi16(row_even, even[1]), _mm256_maddubs_epi16(row_odd, odd[1]));
+    [
+        _mm256_add_epi32(dots[0], _mm256_madd_epi16(four_0, ones)),
+        _mm256_add_epi32(dots[1], _mm256_madd_epi16(four_1, ones)),
+    ]
+}
+
+/// Products of any bytes: each is widened to i16 first.
 #[target_feature(enable = "avx2")]
 #[inline]
 fn dots_wide(rows: &Block<ROWS>, columns: [&Block<WIDTH>; GROUP]) -> Tile {
-    let low_bytes = _mm256_set1_epi16(0xff);
-    let mut dots = [[_mm256_setzero_si256(); GROUP]; ROWS];
+    let zero = [_mm256_setzero_si256(); GROUP];
+    let (mut dots_0, mut dots_1, mut dots_2, mut dots_3) = (zero, zero, zero, zero);
     for quad in 0..QUADS {
-        for c in 0..GROUP {
-            let column = load(&columns[c].0[quad]);
-            let column_even = _mm256_srai_epi16::<8>(_mm256_slli_epi16::<8>(column));
-            let column_odd = _mm256_srai_epi16::<8>(column);
-            for r in 0..ROWS {
-                let row = _mm256_set1_epi32(rows.0[quad][r]);
-                let even = _mm256_madd_epi16(_mm256_and_si256(row, low_bytes), column_even);
-                let odd = _mm256_madd_epi16(_mm256_srli_epi16::<8>(row), column_odd);
-                dots[r][c] = _mm256_add_epi32(dots[r][c], _mm256_add_epi32(even, odd));
-            }
-        }
+        let row = &rows.0[quad];
+        let bytes = [load(&columns[0].0[quad]), load(&columns[1].0[quad])];
+        let even = [
+            _mm256_srai_epi16::<8>(_mm256_slli_epi16::<8>(bytes[0])),
+            _mm256_srai_epi16::<8>(_mm256_slli_epi16::<8>(bytes[1])),
+        ];
+        let odd = [_mm256_srai_epi16::<8>(bytes[0]), _mm256_srai_epi16::<8>(bytes[1])];
+        dots_0 = add_wide(dots_0, row[0], even, odd);
+        dots_1 = add_wide(dots_1, row[1], even, odd);
+        dots_2 = add_wide(dots_2, row[2], even, odd);
+        dots_3 = add_wide(dots_3, row[3], even, odd);
     }
-    dots
+    [dots_0, dots_1, dots_2, dots_3]
+}
+
+#[target_feature(enable = "avx2")]
+#[inline]
+fn add_wide(
+    dots: [__m256i; GROUP],
+    row: i32,
+    even: [__m256i; GROUP],
+    odd: [__m256i; GROUP],
+) -> [__m256i; GROUP] {
+    let bytes = _mm256_set1_epi32(row);
+    let row_even = _mm256_and_si256(bytes, _mm256_set1_epi16(0xff));
+    let row_odd = _mm256_srli_epi16::<8>(bytes);
+    let two_0 = _mm256_add_epi32(_mm256_madd_epi16(row_even, even[0]), _mm256_madd_epi16(row_odd, odd[0]));
+    let two_1 = _mm256_add_epi32(_mm256_madd_epi16(row_even, even[1]), _mm256_madd_epi16(row_odd, odd[1]));
+    [_mm256_add_epi32(dots[0], two_0), _mm256_add_epi32(dots[1], two_1)]
 }
 
 /// Offers the few scores of a tile that beat a second best.
@@ -152,9 +184,7 @@ fn offer(scores: &Tile, better: &Tile, (strip, group): (usize, usize), state: &m
             if mask == 0 {
                 continue;
             }
-            let mut values = [0; WIDTH];
-            // SAFETY: `values` is 32 bytes long, and the store needs no alignment.
-            unsafe { _mm256_storeu_si256(values.as_mut_ptr().cast(), scores[r][c]) };
+            let values: [i32; WIDTH] = bytemuck::must_cast(scores[r][c]);
             while mask != 0 {
                 let lane = mask.trailing_zeros() as usize;
                 mask &= mask - 1;
@@ -169,8 +199,7 @@ fn offer(scores: &Tile, better: &Tile, (strip, group): (usize, usize), state: &m
 #[target_feature(enable = "avx2")]
 #[inline]
 fn load(words: &[i32; WIDTH]) -> __m256i {
-    // SAFETY: the reference covers 32 bytes, and the load needs no alignment.
-    unsafe { _mm256_loadu_si256(words.as_ptr().cast()) }
+    bytemuck::must_cast(*words)
 }
 
 /// The `block`-th group of `L` values.
