@@ -11,5 +11,6 @@ pub mod metadata;
 pub mod pairs;
 pub mod retrieval;
 pub mod sift;
+pub mod verification;
 
 pub use error::FrontendError;

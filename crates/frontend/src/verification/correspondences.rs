@@ -1,0 +1,133 @@
+//! Matches as points: in pixels and on the plane z = 1 of each camera, best first.
+
+use nalgebra::Vector2;
+use terrane_scene::{CameraRecord, FocalSource, ImagePair, Keypoint, MatchedPair, PairSummary};
+
+use super::models::Geometry;
+use super::{Candidate, VerificationOptions};
+
+/// The usable matches of a pair, by falling quality.
+pub(super) struct Correspondences {
+    /// Feature of the first image, feature of the second.
+    matches: Vec<[u32; 2]>,
+    pub(super) first_px: Vec<Vector2<f64>>,
+    pub(super) second_px: Vec<Vector2<f64>>,
+    /// On the plane z = 1.
+    pub(super) first: Vec<Vector2<f64>>,
+    /// On the plane z = 1.
+    pub(super) second: Vec<Vector2<f64>>,
+    /// Whether each point lies in the border of its image and the match does not move.
+    is_static: Vec<bool>,
+    /// Whether both focal lengths are given or from EXIF.
+    pub(super) is_calibrated: bool,
+    /// The greatest error in pixels.
+    pub(super) threshold_px: f64,
+    /// The same on the plane z = 1, as the mean of both cameras.
+    pub(super) threshold: f64,
+    /// Focal lengths and principal points, for fundamental matrices.
+    pub(super) cameras: [terrane_geometry::Camera; 2],
+}
+
+impl Correspondences {
+    /// Leaves out matches of keypoints that do not exist, are not finite or lie beyond the camera's domain, and a static
+    /// border where most matches move.
+    pub(super) fn new(candidate: &Candidate<'_>, options: &VerificationOptions) -> Self {
+        let cameras = [candidate.first.camera, candidate.second.camera];
+        let is_trusted = |record: &CameraRecord| record.focal_source != FocalSource::Guess;
+        let threshold_px = options.max_error_px;
+        let mut points = Self {
+            matches: Vec::new(),
+            first_px: Vec::new(),
+            second_px: Vec::new(),
+            first: Vec::new(),
+            second: Vec::new(),
+            is_static: Vec::new(),
+            is_calibrated: cameras.iter().all(|record| is_trusted(record)),
+            threshold_px,
+            threshold: cameras
+                .iter()
+                .map(|record| record.camera.normalized_from_px(threshold_px))
+                .sum::<f64>()
+                / 2.0,
+            cameras: cameras.map(|record| record.camera),
+        };
+        let mut order: Vec<_> = candidate.matches.iter().collect();
+        order.sort_by(|a, b| a.ratio.total_cmp(&b.ratio).then((a.first, a.second).cmp(&(b.first, b.second))));
+        for found in order {
+            let ends = [
+                candidate.first.keypoints.get(found.first as usize),
+                candidate.second.keypoints.get(found.second as usize),
+            ];
+            if let [Some(a), Some(b)] = ends {
+                points.push([found.first, found.second], a, b, options.watermark_border);
+            }
+        }
+        points.drop_static_border();
+        points
+    }
+
+    fn push(&mut self, indices: [u32; 2], a: &Keypoint, b: &Keypoint, border: f64) {
+        let pixel = |keypoint: &Keypoint| Vector2::new(f64::from(keypoint.x_px), f64::from(keypoint.y_px));
+        let (a_px, b_px) = (pixel(a), pixel(b));
+        let finite = |point: &Vector2<f64>| point.x.is_finite() && point.y.is_finite();
+        let rays = (self.cameras[0].unproject(&a_px), self.cameras[1].unproject(&b_px));
+        let (Some(a), Some(b)) = rays else { return };
+        if !(finite(&a) && finite(&b)) {
+            return;
+        }
+        let in_border = |camera: &terrane_geometry::Camera, point: &Vector2<f64>| {
+            let (width, height) = (f64::from(camera.width_px), f64::from(camera.height_px));
+            let margin = border * width.hypot(height);
+            point.x < margin || point.y < margin || point.x > width - margin || point.y > height - margin
+        };
+        let stays = (a_px - b_px).norm() <= self.threshold_px;
+        let bordered = in_border(&self.cameras[0], &a_px) && in_border(&self.cameras[1], &b_px);
+        self.matches.push(indices);
+        self.first_px.push(a_px);
+        self.second_px.push(b_px);
+        self.first.push(a);
+        self.second.push(b);
+        self.is_static.push(stays && bordered);
+    }
+
+    /// Matches that stay in the border are no part of the scene when most others move: a time stamp would outvote a small
+    /// overlap. Where hardly anything moves they may be the scene itself, and are kept.
+    fn drop_static_border(&mut self) {
+        let stays = |i: usize| (self.first_px[i] - self.second_px[i]).norm() <= self.threshold_px;
+        let num_staying = (0..self.len()).filter(|&i| stays(i)).count();
+        if 2 * num_staying >= self.len() || !self.is_static.contains(&true) {
+            return;
+        }
+        let keep: Vec<usize> = (0..self.len()).filter(|&i| !self.is_static[i]).collect();
+        self.matches = keep.iter().map(|&i| self.matches[i]).collect();
+        for points in [&mut self.first_px, &mut self.second_px, &mut self.first, &mut self.second] {
+            *points = keep.iter().map(|&i| points[i]).collect();
+        }
+        self.is_static = vec![false; keep.len()];
+    }
+
+    /// How many usable matches there are.
+    pub(super) fn len(&self) -> usize {
+        self.matches.len()
+    }
+
+    /// How many of these stay at their place in the border.
+    pub(super) fn num_static(&self, indices: &[u32]) -> usize {
+        indices.iter().filter(|&&i| self.is_static[i as usize]).count()
+    }
+
+    /// The result, with matches ascending.
+    pub(super) fn matched_pair(&self, pair: ImagePair, geometry: &Geometry) -> MatchedPair {
+        let mut matches: Vec<[u32; 2]> = geometry.inliers.iter().map(|&i| self.matches[i as usize]).collect();
+        matches.sort_unstable();
+        matches.dedup();
+        let summary = PairSummary {
+            pair,
+            kind: geometry.kind,
+            num_inliers: matches.len() as u32,
+            second_from_first: geometry.second_from_first,
+            median_angle_rad: geometry.median_angle_rad,
+        };
+        MatchedPair { summary, matches }
+    }
+}
