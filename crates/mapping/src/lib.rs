@@ -6,12 +6,18 @@
 //! number of threads. A cluster of which nothing can be rebuilt is an outcome with reasons.
 
 mod assemble;
+mod bundle;
 mod cluster;
 mod error;
+mod focal;
+mod grow;
+mod initial;
 mod input;
 mod model;
 mod options;
+mod points;
 mod reconstruct;
+mod registration;
 mod report;
 mod visibility;
 
@@ -22,3 +28,6 @@ pub use options::{
 };
 pub use reconstruct::reconstruct;
 pub use report::{InitialTrial, MappingReport, SubmapReport, TrialVerdict};
+
+#[cfg(test)]
+mod tests;

@@ -35,6 +35,13 @@ pub(crate) struct Point {
     pub track: Track,
 }
 
+/// Where everything of a model is.
+pub(crate) struct Geometry {
+    cameras: Vec<Camera>,
+    poses: Vec<Option<Rigid3>>,
+    positions: Vec<(PointId, Vector3<f64>)>,
+}
+
 /// One submap as it grows.
 #[derive(Clone)]
 pub(crate) struct Model<'a> {
@@ -44,6 +51,8 @@ pub(crate) struct Model<'a> {
     pub cameras: Vec<Camera>,
     /// Cameras whose intrinsics are not refined any more.
     pub frozen: Vec<bool>,
+    /// Cameras whose focal length is a mere guess.
+    pub guessed: Vec<bool>,
     /// `cam_from_world` of each image that is registered.
     pub poses: Vec<Option<Rigid3>>,
     /// What each image sees of it.
@@ -58,12 +67,13 @@ pub(crate) struct Model<'a> {
 
 impl<'a> Model<'a> {
     /// An empty model with these intrinsics.
-    pub fn new(cluster: &'a Cluster<'a>, cameras: Vec<Camera>) -> Self {
+    pub fn new(cluster: &'a Cluster<'a>, cameras: Vec<Camera>, guessed: Vec<bool>) -> Self {
         let num_images = cluster.num_images();
         Self {
             cluster,
             frozen: vec![false; cameras.len()],
             cameras,
+            guessed,
             poses: vec![None; num_images],
             visibility: Visibility::new(cluster),
             points: Vec::new(),
@@ -211,6 +221,12 @@ impl<'a> Model<'a> {
         }
     }
 
+    /// Registers an image.
+    pub fn set_pose(&mut self, image: usize, cam_from_world: Rigid3) {
+        self.poses[image] = Some(cam_from_world);
+        self.guessed[self.cluster.camera_of[image]] = false;
+    }
+
     /// Removes an image and its observations.
     pub fn deregister(&mut self, image: usize) {
         for feature in self.cluster.features_of(image) {
@@ -256,6 +272,21 @@ impl<'a> Model<'a> {
         }
         for point in self.points.iter_mut().flatten() {
             point.x_in_world = new_from_old.transform_point(&point.x_in_world);
+        }
+    }
+
+    /// Intrinsics, poses and positions, to go back to while the same points are there.
+    pub fn clone_geometry(&self) -> Geometry {
+        let positions = self.points().map(|(id, point)| (id, point.x_in_world)).collect();
+        Geometry { cameras: self.cameras.clone(), poses: self.poses.clone(), positions }
+    }
+
+    /// Goes back to earlier intrinsics, poses and positions.
+    pub fn restore_geometry(&mut self, geometry: &Geometry) {
+        self.cameras.clone_from(&geometry.cameras);
+        self.poses.clone_from(&geometry.poses);
+        for (id, x_in_world) in &geometry.positions {
+            self.set_position(*id, *x_in_world);
         }
     }
 
