@@ -3,6 +3,9 @@
 //! This crate knows no images, files, threads or ids: numbers in, numbers out. Frames, units and signs follow
 //! `docs/conventions.md`.
 
+// `!(a > b)` is how values that are not numbers end on the refusing side.
+#![allow(clippy::neg_cmp_op_on_partial_ord)]
+
 pub mod absolute_pose;
 pub mod alignment;
 pub mod camera;
@@ -12,6 +15,8 @@ pub mod fundamental;
 pub mod geodesy;
 pub mod homography;
 mod linear;
+#[cfg(test)]
+mod manifold_tests;
 pub mod p3p;
 mod polynomial;
 pub mod ransac;

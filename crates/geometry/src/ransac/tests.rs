@@ -44,7 +44,7 @@ impl Estimator for Mock {
 
 /// `count` data of which every `1/share`-th is 7 and the others all differ.
 fn votes(count: usize, period: usize) -> Vec<i64> {
-    (0..count as i64).map(|i| if i as usize % period == 0 { 7 } else { 100 + 10 * i }).collect()
+    (0..count as i64).map(|i| if (i as usize).is_multiple_of(period) { 7 } else { 100 + 10 * i }).collect()
 }
 
 #[test]
