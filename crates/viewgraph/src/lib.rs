@@ -4,7 +4,7 @@
 //! and drops what disagrees; [`partition`] cuts what is left into clusters of bounded size whose seams share
 //! photographs. This crate never sees pixels, matches, files or the network.
 
-mod build;
+//mod build;
 mod components;
 mod graph;
 mod options;

@@ -1,5 +1,14 @@
 //! Satellite positions to a local frame, and reconstructions into it.
 
+mod fit;
+mod frame;
+mod positions;
+#[cfg(test)]
+mod tests;
+
+pub use fit::{register, residuals};
+pub use positions::local_positions;
+
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 use terrane_geometry::Sim3;
@@ -49,7 +58,7 @@ pub struct GeoOptions {
     /// RANSAC's threshold, in standard deviations of a position. Default 3.
     pub max_deviations: f64,
     /// Least spread of the positions across their main direction, in standard deviations of a position; below it
-    /// they are collinear and the turn about that line is not theirs to tell. Default 2.
+    /// they are collinear and the turn about that line is not theirs to tell. Default 1.5: noise alone shows 1.
     pub min_spread_deviations: f64,
     /// Part of the positions that must agree. Range: 0 to 1. Default 0.3.
     pub min_inlier_ratio: f64,
@@ -62,7 +71,7 @@ impl Default for GeoOptions {
         Self {
             min_positions: 3,
             max_deviations: 3.0,
-            min_spread_deviations: 2.0,
+            min_spread_deviations: 1.5,
             min_inlier_ratio: 0.3,
             max_iterations: 2000,
         }

@@ -18,8 +18,8 @@ const NUM_PASSES: usize = 6;
 pub(super) fn cut(graph: &WeightedGraph, max_size: u64, seed: Seed) -> Vec<u32> {
     let mut part_of = vec![0; graph.len()];
     let mut num_parts = 0;
-    // One in ten spare, so that cuts may follow the scene rather than the count.
-    let wanted = (graph.total_size() as f64 * 1.1 / max_size as f64).ceil() as u64;
+    // One in twenty spare, so that cuts may follow the scene rather than the count.
+    let wanted = (graph.total_size() as f64 * 1.05 / max_size as f64).ceil() as u64;
     let mut open = vec![((0..graph.len() as u32).collect::<Vec<_>>(), wanted, seed)];
     while let Some((nodes, wanted, seed)) = open.pop() {
         let size: u64 = nodes.iter().map(|node| u64::from(graph.size[*node as usize])).sum();

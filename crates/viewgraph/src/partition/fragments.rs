@@ -1,51 +1,54 @@
 //! Parts that fell into pieces, mended.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use super::coarsen::WeightedGraph;
 
 /// Makes parts connected: the largest piece of a part stays, the others go to the neighbouring part that holds them
-/// strongest and has room (first up to the core's bound, then up to the cluster's), or become parts of their own.
-/// Parts are renumbered without gaps by their lowest node; returns how many there are.
+/// strongest and has room (first up to the core's bound, then up to half of what is meant for overlap), or become
+/// parts of their own. Parts are renumbered without gaps by their lowest node; returns how many there are.
 pub(super) fn mend(graph: &WeightedGraph, part_of: &mut [u32], (core, max): (u64, u64)) -> u32 {
-    let pieces = pieces(graph, part_of);
-    let mut kept: Vec<(u32, usize)> = Vec::new();
-    let mut loose = Vec::new();
-    // Largest first, so that the first piece of a part is the one that stays.
-    for piece in pieces {
-        let part = part_of[piece[0] as usize];
-        if kept.iter().any(|(other, _)| *other == part) {
-            loose.push(piece);
-        } else {
-            kept.push((part, piece.len()));
-        }
+    // Every piece is a part of its own at first; `members` keeps each part connected from here on.
+    let mut members = pieces(graph, part_of);
+    let mut stays = vec![true; members.len()];
+    let mut seen = BTreeSet::new();
+    for (piece, nodes) in members.iter().enumerate() {
+        stays[piece] = seen.insert(part_of[nodes[0] as usize]);
     }
-    let mut next_part = part_of.iter().max().map_or(0, |part| part + 1);
-    for piece in loose {
-        let home = part_of[piece[0] as usize];
-        let mut hold: Vec<(u32, f64)> = Vec::new();
-        for node in &piece {
-            for (neighbor, weight) in graph.neighbors(*node) {
-                let part = part_of[*neighbor as usize];
-                if part == home {
-                    continue;
-                }
-                match hold.iter_mut().find(|entry| entry.0 == part) {
-                    Some(entry) => entry.1 += weight,
-                    None => hold.push((part, *weight)),
-                }
-            }
+    for (piece, nodes) in members.iter().enumerate() {
+        nodes.iter().for_each(|node| part_of[*node as usize] = piece as u32);
+    }
+    for piece in (0..members.len()).filter(|piece| !stays[*piece]) {
+        let size = members[piece].len() as u64;
+        let hold = holds(graph, part_of, &members[piece]);
+        let fits = |room: u64| {
+            hold.iter().map(|entry| entry.0).find(|part| members[*part as usize].len() as u64 + size <= room)
+        };
+        let small = size * 4 < core;
+        let home = fits(core).or_else(|| if small { fits((core + max) / 2) } else { None });
+        if let Some(home) = home {
+            let nodes = std::mem::take(&mut members[piece]);
+            nodes.iter().for_each(|node| part_of[*node as usize] = home);
+            members[home as usize].extend(nodes);
         }
-        hold.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
-        let size_of = |part: u32| part_of.iter().filter(|other| **other == part).count() as u64;
-        let fits = |room: u64| hold.iter().map(|entry| entry.0).find(|part| size_of(*part) + piece.len() as u64 <= room);
-        // A small piece may use room that was meant for overlap; a large one stands alone.
-        let new_home = fits(core).or_else(|| if piece.len() as u64 * 4 < core { fits((core + max) / 2) } else { None });
-        let new_home = new_home.unwrap_or_else(|| {
-            next_part += 1;
-            next_part - 1
-        });
-        piece.iter().for_each(|node| part_of[*node as usize] = new_home);
     }
     renumber(part_of)
+}
+
+/// Other parts that hold a part's nodes, with the weight of the edges, strongest first.
+fn holds(graph: &WeightedGraph, part_of: &[u32], nodes: &[u32]) -> Vec<(u32, f64)> {
+    let mut hold: BTreeMap<u32, f64> = BTreeMap::new();
+    for node in nodes {
+        for (neighbor, weight) in graph.neighbors(*node) {
+            let part = part_of[*neighbor as usize];
+            if part != part_of[*node as usize] {
+                *hold.entry(part).or_insert(0.0) += weight;
+            }
+        }
+    }
+    let mut hold: Vec<(u32, f64)> = hold.into_iter().collect();
+    hold.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+    hold
 }
 
 /// The connected pieces of all parts, largest first, ties by the lowest node; nodes ascend.
