@@ -27,6 +27,8 @@ pub mod merge;
 pub mod seams;
 mod statistics;
 mod summary;
+#[cfg(test)]
+mod test_support;
 
 pub use error::FusionError;
 pub use summary::{CameraLink, SubmapSummary};

@@ -1,11 +1,14 @@
 //! Hierarchical adjustment: seams first, then the whole, over shards that the caller keeps.
 
+
 use std::borrow::Cow;
 
 use serde::{Deserialize, Serialize};
 use terrane_scene::{CameraId, ImageId};
 
-use crate::{FusionError, georegister::LocalPosition, merge::MergedShard};
+use crate::FusionError;
+use crate::georegister::LocalPosition;
+use crate::merge::MergedShard;
 
 /// Where the caller keeps the shards: memory, a local disk, or a store.
 pub trait MergedShards: Sync {
@@ -135,4 +138,6 @@ pub struct AdjustReport {
     pub num_observations: u64,
     /// Satellite positions that took part.
     pub num_positions: u32,
+    /// Images left out at the end, as too few observations hold them.
+    pub dropped_images: Vec<ImageId>,
 }

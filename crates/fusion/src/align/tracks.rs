@@ -234,23 +234,28 @@ fn weight(datum: &Correspondence, model: &Sim3) -> f64 {
 
 /// The information of `model` about its left perturbation, as if `effective` of the data were independent:
 /// neighbours share the bending of their submaps, so thousands of points don't make thousands of measurements.
+/// Lowered where the data spread more than their standard deviations say.
 pub(crate) fn information(data: &[Correspondence], model: &Sim3, effective: f64) -> SMatrix<f64, 7, 7> {
     let mut sum = SMatrix::<f64, 7, 7>::zeros();
-    let mut count = 0.0;
+    let (mut count, mut squared_sigmas) = (0.0, 0.0);
     for datum in data {
-        let weight = weight(datum, model);
-        if weight == 0.0 {
+        let x = model.transform_point(&datum.x_in_a);
+        let distance = (x - datum.x_in_b).norm();
+        if distance > datum.threshold {
             continue;
         }
-        let x = model.transform_point(&datum.x_in_a);
         let mut jacobian = SMatrix::<f64, 3, 7>::zeros();
         jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(&-so3::skew(&x));
         jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&Matrix3::identity());
         jacobian.set_column(6, &x);
-        sum += weight * jacobian.transpose() * jacobian;
+        sum += jacobian.transpose() * jacobian / datum.sigma.powi(2);
         count += 1.0;
+        squared_sigmas += (distance / datum.sigma).powi(2);
     }
-    if count > effective { sum * (effective / count) } else { sum }
+    // Three residuals to a datum.
+    let spread = if count > 0.0 { (squared_sigmas / (3.0 * count)).max(1.0) } else { 1.0 };
+    let part = if count > effective { effective / count } else { 1.0 };
+    sum * (part / spread)
 }
 
 /// RMS distance of the correspondences within their thresholds, and how many there are.

@@ -1,7 +1,7 @@
 //! Placing submaps, then cameras, by joint robust solves.
 
 mod cameras;
-mod place;
+mod placement;
 
 pub use cameras::{CameraAverageOptions, CameraAverageReport, CameraAverages};
-pub use place::{PlaceOptions, PlacedComponent, PlacedSeam, Placement};
+pub use placement::{PlaceOptions, PlacedComponent, PlacedSeam, Placement};
