@@ -39,8 +39,10 @@ pub fn measure(
     let cameras = tracks::shared_cameras(a, b);
     let (mut distances, mut rotations) = (Vec::new(), Vec::new());
     for camera in &cameras {
-        let (in_a, in_b) =
-            (world_from_a.transform_camera(&camera.cam_from_a), world_from_b.transform_camera(&camera.cam_from_b));
+        let (in_a, in_b) = (
+            world_from_a.transform_camera(&camera.cam_from_a),
+            world_from_b.transform_camera(&camera.cam_from_b),
+        );
         distances.push((in_a.center() - in_b.center()).norm());
         rotations.push(so3::angle_between(&in_a.rotation, &in_b.rotation).to_degrees());
     }

@@ -54,7 +54,10 @@ fn add(a: FilterCounts, b: FilterCounts) -> FilterCounts {
 }
 
 /// Figures without dropping anything; observations behind their camera are not counted.
-pub(super) fn measure(cameras: &MergedCameras, shards: &dyn MergedShards) -> Result<FilterCounts, FusionError> {
+pub(super) fn measure(
+    cameras: &MergedCameras,
+    shards: &dyn MergedShards,
+) -> Result<FilterCounts, FusionError> {
     let view = Views::new(cameras);
     let mut total = FilterCounts::default();
     for shard in 0..shards.len() {
@@ -63,7 +66,8 @@ pub(super) fn measure(cameras: &MergedCameras, shards: &dyn MergedShards) -> Res
             .points
             .par_iter()
             .map(|point| {
-                let errors = merged.track(point).iter().filter_map(|seen| view.error_px(&point.x_in_world, seen));
+                let errors =
+                    merged.track(point).iter().filter_map(|seen| view.error_px(&point.x_in_world, seen));
                 errors.fold((0.0, 0), |(sum, count), error| (sum + error, count + 1))
             })
             .collect();
@@ -104,7 +108,8 @@ impl<'a> Views<'a> {
     fn error_px(&self, x_in_world: &Vector3<f64>, seen: &Observation) -> Option<f64> {
         let image = &self.cameras.images[self.index.of(seen.image)? as usize];
         let place = self.cameras.cameras.binary_search_by_key(&image.camera, |entry| entry.0).ok()?;
-        let xy_px = self.cameras.cameras[place].1.project(&image.cam_from_world.transform_point(x_in_world))?;
+        let xy_px =
+            self.cameras.cameras[place].1.project(&image.cam_from_world.transform_point(x_in_world))?;
         Some((xy_px - seen.xy_px()).norm()).filter(|error| error.is_finite())
     }
 
@@ -113,7 +118,11 @@ impl<'a> Views<'a> {
     }
 }
 
-fn filter_shard(view: &Views<'_>, merged: &MergedShard, options: &AdjustOptions) -> (MergedShard, FilterCounts) {
+fn filter_shard(
+    view: &Views<'_>,
+    merged: &MergedShard,
+    options: &AdjustOptions,
+) -> (MergedShard, FilterCounts) {
     let kept: Vec<(Vec<Observation>, f64)> = merged
         .points
         .par_iter()
@@ -165,5 +174,7 @@ fn kept_track(
 
 /// Whether two of the rays are at least so far apart.
 fn is_wide(rays: &[Vector3<f64>], min_angle_rad: f64) -> bool {
-    rays.iter().enumerate().any(|(at, first)| rays[at + 1..].iter().any(|second| first.angle(second) >= min_angle_rad))
+    rays.iter()
+        .enumerate()
+        .any(|(at, first)| rays[at + 1..].iter().any(|second| first.angle(second) >= min_angle_rad))
 }

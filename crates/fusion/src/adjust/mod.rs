@@ -1,5 +1,13 @@
 //! Hierarchical adjustment: seams first, then the whole, over shards that the caller keeps.
 
+mod filter;
+mod problem;
+mod run;
+mod seam;
+#[cfg(test)]
+mod tests;
+
+pub use run::adjust;
 
 use std::borrow::Cow;
 

@@ -39,8 +39,10 @@ impl PoseIndex {
 /// camera is not there are held at the first intrinsics and must own no observations.
 pub(super) fn camera_problem(cameras: &MergedCameras, fixed_intrinsics: &[CameraId]) -> BundleProblem {
     let poses: Vec<Rigid3> = cameras.images.iter().map(|image| image.cam_from_world).collect();
-    let place = |camera: CameraId| cameras.cameras.binary_search_by_key(&camera, |entry| entry.0).unwrap_or(0);
-    let intrinsics_of_pose: Vec<u32> = cameras.images.iter().map(|image| place(image.camera) as u32).collect();
+    let place =
+        |camera: CameraId| cameras.cameras.binary_search_by_key(&camera, |entry| entry.0).unwrap_or(0);
+    let intrinsics_of_pose: Vec<u32> =
+        cameras.images.iter().map(|image| place(image.camera) as u32).collect();
     let intrinsics = cameras.cameras.iter().map(|entry| entry.1).collect();
     let mut problem =
         BundleProblem::new(poses, intrinsics, intrinsics_of_pose, RefineIntrinsics::FOCAL_AND_DISTORTION);
@@ -136,7 +138,8 @@ impl Shards for AdjustShards<'_> {
     }
 
     fn store_points(&mut self, shard: usize, points: &[Vector3<f64>]) -> Result<(), ShardError> {
-        let mut merged: MergedShard = self.inner.load(shard).map_err(|error| failed(shard, error))?.into_owned();
+        let mut merged: MergedShard =
+            self.inner.load(shard).map_err(|error| failed(shard, error))?.into_owned();
         for (point, x_in_world) in merged.points.iter_mut().zip(points) {
             point.x_in_world = *x_in_world;
         }

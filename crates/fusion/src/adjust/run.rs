@@ -42,7 +42,8 @@ pub fn adjust(
         }
         let index = PoseIndex::new(&cameras.images);
         let mut adapter = AdjustShards { inner: &mut *shards, index: &index };
-        let solved = bundle::solve(&mut problem, &mut adapter, &bundle_options).map_err(FusionError::adjustment)?;
+        let solved =
+            bundle::solve(&mut problem, &mut adapter, &bundle_options).map_err(FusionError::adjustment)?;
         problem::take_over(&problem, cameras);
         figures = filter::filter(cameras, shards, options)?;
         let before = figures.observations + figures.dropped_observations;
@@ -105,12 +106,15 @@ fn round_of(name: String, solved: &BundleReport) -> AdjustRound {
 
 /// Cameras must ascend, and every image's camera must be there.
 fn check(cameras: &MergedCameras) -> Result<(), FusionError> {
-    if !cameras.images.is_sorted_by_key(|image| image.image) || !cameras.cameras.is_sorted_by_key(|entry| entry.0) {
+    if !cameras.images.is_sorted_by_key(|image| image.image)
+        || !cameras.cameras.is_sorted_by_key(|entry| entry.0)
+    {
         return Err(FusionError::invalid("the camera table", "cameras and images must ascend by id"));
     }
     for image in &cameras.images {
         if cameras.cameras.binary_search_by_key(&image.camera, |entry| entry.0).is_err() {
-            let reason = format!("image {} was taken by camera {}, which is not there", image.image, image.camera);
+            let reason =
+                format!("image {} was taken by camera {}, which is not there", image.image, image.camera);
             return Err(FusionError::invalid("the camera table", reason));
         }
     }

@@ -76,7 +76,8 @@ fn gather(
     if images.is_empty() {
         return Ok(None);
     }
-    let pose_of: BTreeMap<ImageId, u32> = images.iter().enumerate().map(|(at, image)| (*image, at as u32)).collect();
+    let pose_of: BTreeMap<ImageId, u32> =
+        images.iter().enumerate().map(|(at, image)| (*image, at as u32)).collect();
     let observations = seen_by
         .iter()
         .map(|(point, seen)| BundleObservation {

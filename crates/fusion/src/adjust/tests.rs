@@ -17,7 +17,8 @@ fn disturbed(center_m: f64, num_shards: usize) -> (Reconstruction, MergedCameras
     for image in &mut cameras.images {
         let center = image.cam_from_world.center() + center_m * draws.vector();
         let turn = so3::exp(&(center_m / 100.0 * draws.vector()));
-        image.cam_from_world = Rigid3::from_rotation_and_center(turn * image.cam_from_world.rotation, &center);
+        image.cam_from_world =
+            Rigid3::from_rotation_and_center(turn * image.cam_from_world.rotation, &center);
     }
     let mut shards = vec![MergedShard::default(); num_shards];
     for (at, point) in truth.points.iter().enumerate() {
@@ -62,8 +63,8 @@ fn wrong_observations_are_dropped() {
     for seen in shards[0].observations.iter_mut().step_by(25) {
         seen.x_px += 40.0;
     }
-    let report =
-        adjust(&mut cameras, &mut shards, &AdjustInput::default(), &AdjustOptions::default()).expect("it adjusts");
+    let report = adjust(&mut cameras, &mut shards, &AdjustInput::default(), &AdjustOptions::default())
+        .expect("it adjusts");
     let dropped: u64 = report.rounds.iter().map(|round| round.num_dropped_observations).sum();
     assert!(dropped >= count as u64 / 25 && dropped < count as u64 / 8, "{dropped} of {count}");
     let error = compare::cameras(&whole(&cameras, &shards), &truth, true).expect("enough cameras");
@@ -106,7 +107,10 @@ fn a_fixed_camera_keeps_its_intrinsics_and_a_free_one_finds_them() {
         let got = cameras.cameras[0].1.mean_focal_px();
         let wanted = truth.cameras[0].1.mean_focal_px();
         if expect_found {
-            assert!((got - wanted).abs() < (told - wanted).abs(), "{got} is no nearer to {wanted} than {told}");
+            assert!(
+                (got - wanted).abs() < (told - wanted).abs(),
+                "{got} is no nearer to {wanted} than {told}"
+            );
         } else {
             assert_eq!(got, told);
         }
@@ -129,11 +133,12 @@ fn an_image_that_nothing_holds_is_left_out() {
     let mut draws = Draws::new(2);
     for shard in &mut shards {
         for seen in shard.observations.iter_mut().filter(|seen| seen.image == lonely) {
-            (seen.x_px, seen.y_px) = (600.0 + 500.0 * draws.signed() as f32, 450.0 + 400.0 * draws.signed() as f32);
+            (seen.x_px, seen.y_px) =
+                (600.0 + 500.0 * draws.signed() as f32, 450.0 + 400.0 * draws.signed() as f32);
         }
     }
-    let report =
-        adjust(&mut cameras, &mut shards, &AdjustInput::default(), &AdjustOptions::default()).expect("it adjusts");
+    let report = adjust(&mut cameras, &mut shards, &AdjustInput::default(), &AdjustOptions::default())
+        .expect("it adjusts");
     assert_eq!(report.dropped_images, [lonely]);
     assert!(cameras.images.iter().all(|image| image.image != lonely));
     assert!(shards.iter().all(|shard| shard.observations.iter().all(|seen| seen.image != lonely)));

@@ -46,15 +46,20 @@ pub(crate) fn similarity(cameras: &[SharedCamera]) -> Option<Sim3> {
     if cameras.len() < 2 {
         return None;
     }
-    let turns: Vec<_> =
-        cameras.iter().map(|camera| camera.cam_from_b.rotation.inverse() * camera.cam_from_a.rotation).collect();
+    let turns: Vec<_> = cameras
+        .iter()
+        .map(|camera| camera.cam_from_b.rotation.inverse() * camera.cam_from_a.rotation)
+        .collect();
     // The medoid: robust, and no average of rotations is needed.
-    let total = |turn: &nalgebra::UnitQuaternion<f64>| turns.iter().map(|other| turn.angle_to(other)).sum::<f64>();
+    let total =
+        |turn: &nalgebra::UnitQuaternion<f64>| turns.iter().map(|other| turn.angle_to(other)).sum::<f64>();
     let rotation = *turns.iter().min_by(|x, y| total(x).total_cmp(&total(y)))?;
     let count = cameras.len() as f64;
-    let in_a: Vec<Vector3<f64>> = cameras.iter().map(|camera| rotation * camera.cam_from_a.center()).collect();
+    let in_a: Vec<Vector3<f64>> =
+        cameras.iter().map(|camera| rotation * camera.cam_from_a.center()).collect();
     let in_b: Vec<Vector3<f64>> = cameras.iter().map(|camera| camera.cam_from_b.center()).collect();
-    let (mean_a, mean_b) = (in_a.iter().sum::<Vector3<f64>>() / count, in_b.iter().sum::<Vector3<f64>>() / count);
+    let (mean_a, mean_b) =
+        (in_a.iter().sum::<Vector3<f64>>() / count, in_b.iter().sum::<Vector3<f64>>() / count);
     let (mut along, mut spread) = (0.0, 0.0);
     for (a, b) in in_a.iter().zip(&in_b) {
         along += (a - mean_a).dot(&(b - mean_b));

@@ -209,7 +209,8 @@ impl<'a> Target<'a> {
             .enumerate()
             .map(|(at, x)| {
                 let x = target_from_source.transform_point(x);
-                let found = self.tree.query(&[x.x, x.y, x.z]).nearest_one::<SquaredEuclidean<f64>>().execute();
+                let found =
+                    self.tree.query(&[x.x, x.y, x.z]).nearest_one::<SquaredEuclidean<f64>>().execute();
                 Match { source: at as u32, target: found.item, squared_distance: found.distance }
             })
             .collect()

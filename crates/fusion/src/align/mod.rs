@@ -149,7 +149,8 @@ pub fn align(a: &Reconstruction, b: &Reconstruction, options: &AlignOptions, see
         median_depth: SubmapSummary::of(b, 0).median_depth,
         ..Default::default()
     };
-    let refused = |reason: String, evidence| SeamOutcome { verdict: SeamVerdict::Refused { reason }, evidence };
+    let refused =
+        |reason: String, evidence| SeamOutcome { verdict: SeamVerdict::Refused { reason }, evidence };
     if cameras.is_empty() {
         return refused("no image is registered in both submaps".to_owned(), evidence);
     }
@@ -179,8 +180,11 @@ pub fn align(a: &Reconstruction, b: &Reconstruction, options: &AlignOptions, see
 
 /// The similarity that enough shared points agree with.
 fn from_tracks(data: &[Correspondence], options: &AlignOptions, seed: Seed) -> Option<Sim3> {
-    let ransac_options =
-        RansacOptions { max_iterations: options.max_iterations.max(1), min_iterations: 50, ..Default::default() };
+    let ransac_options = RansacOptions {
+        max_iterations: options.max_iterations.max(1),
+        min_iterations: 50,
+        ..Default::default()
+    };
     let robust = ransac::run(&SimilarityEstimator { data }, &ransac_options, seed)?;
     let enough = robust.inliers.len() >= options.min_shared_points.max(4) as usize
         && robust.inliers.len() as f64 >= options.min_inlier_ratio * data.len() as f64;
@@ -250,7 +254,8 @@ fn objection(evidence: &SeamEvidence, on_tracks: bool, options: &AlignOptions) -
                 evidence.num_inliers, options.min_shared_points
             ));
         }
-        let carried = evidence.icp.as_ref().is_some_and(|icp| icp.used && icp.num_matches >= options.min_shared_points);
+        let carried =
+            evidence.icp.as_ref().is_some_and(|icp| icp.used && icp.num_matches >= options.min_shared_points);
         let confirmed = evidence.num_inliers * 2 >= evidence.num_shared_points && evidence.num_inliers >= 4;
         if !carried && !confirmed {
             return Some(format!(

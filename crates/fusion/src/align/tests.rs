@@ -120,12 +120,16 @@ fn surface(seed: u64, count: usize) -> Vec<Vector3<f64>> {
 #[test]
 fn icp_converges_on_surfaces_sampled_differently() {
     let target = surface(1, 4000);
-    let moved = Sim3::new(1.04, terrane_geometry::so3::exp(&Vector3::new(0.03, -0.04, 0.05)), Vector3::new(0.2, -0.3, 0.2));
+    let moved = Sim3::new(
+        1.04,
+        terrane_geometry::so3::exp(&Vector3::new(0.03, -0.04, 0.05)),
+        Vector3::new(0.2, -0.3, 0.2),
+    );
     let source: Vec<_> = surface(2, 3000).iter().map(|x| moved.inverse().transform_point(x)).collect();
     for (metric, bound) in [(icp::IcpMetric::PointToPlane, 0.05), (icp::IcpMetric::PointToPoint, 0.25)] {
         let options = icp::IcpOptions { metric, max_iterations: 60, ..Default::default() };
-        let (found, report) =
-            icp::align_points(&source, &target, &Sim3::identity(), &options).expect("clouds are large enough");
+        let (found, report) = icp::align_points(&source, &target, &Sim3::identity(), &options)
+            .expect("clouds are large enough");
         let errors: Vec<f64> =
             source.iter().map(|x| (found.transform_point(x) - moved.transform_point(x)).norm()).collect();
         let rms = crate::statistics::rms(&errors);

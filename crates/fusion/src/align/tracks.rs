@@ -150,7 +150,10 @@ impl Reach {
 
 fn focal_px(reconstruction: &Reconstruction, seen: &Observation) -> Option<f64> {
     let image = reconstruction.image(seen.image)?;
-    reconstruction.camera(image.camera).map(|camera| camera.mean_focal_px()).filter(|focal_px| *focal_px > 0.0)
+    reconstruction
+        .camera(image.camera)
+        .map(|camera| camera.mean_focal_px())
+        .filter(|focal_px| *focal_px > 0.0)
 }
 
 /// Ratios of the shared cameras' distances, b to a, from one camera to the next few.
@@ -278,4 +281,3 @@ pub(crate) fn cost(data: &[Correspondence], model: &Sim3) -> f64 {
         })
         .sum()
 }
-

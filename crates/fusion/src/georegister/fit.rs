@@ -57,7 +57,8 @@ pub fn register(
             data.len()
         ));
     }
-    let kept: Vec<Located> = data.iter().zip(&inlier).filter(|(_, inlier)| **inlier).map(|(d, _)| *d).collect();
+    let kept: Vec<Located> =
+        data.iter().zip(&inlier).filter(|(_, inlier)| **inlier).map(|(d, _)| *d).collect();
     if let Some(reason) = degenerate(&kept, options) {
         return not_registered(format!("among the satellite positions that agree, {reason}"));
     }
@@ -89,8 +90,11 @@ fn residual_report(data: &[Located], inlier: &[bool], enu_from_local: &Sim3) -> 
         })
         .collect();
     let mut all: Vec<f64> = residuals.iter().map(|residual| residual.residual_m.norm()).collect();
-    let of_inliers: Vec<f64> =
-        residuals.iter().filter(|residual| residual.inlier).map(|residual| residual.residual_m.norm()).collect();
+    let of_inliers: Vec<f64> = residuals
+        .iter()
+        .filter(|residual| residual.inlier)
+        .map(|residual| residual.residual_m.norm())
+        .collect();
     GeoReport {
         num_positions: residuals.len() as u32,
         num_inliers: of_inliers.len() as u32,
@@ -104,7 +108,10 @@ fn residual_report(data: &[Located], inlier: &[bool], enu_from_local: &Sim3) -> 
 fn degenerate(data: &[Located], options: &GeoOptions) -> Option<String> {
     let needed = options.min_positions.max(3) as usize;
     if data.len() < needed {
-        return Some(format!("{} registered photographs have a satellite position, {needed} are needed", data.len()));
+        return Some(format!(
+            "{} registered photographs have a satellite position, {needed} are needed",
+            data.len()
+        ));
     }
     let count = data.len() as f64;
     let sigma = data.iter().map(|d| d.position.sigma_m.x).sum::<f64>() / count;
@@ -132,15 +139,19 @@ fn horizontal(x: &Vector3<f64>) -> Vector3<f64> {
 fn spread(points: impl Iterator<Item = Vector3<f64>> + Clone, count: f64) -> (f64, f64) {
     let mean = points.clone().sum::<Vector3<f64>>() / count;
     let covariance: Matrix3<f64> = points.map(|x| (x - mean) * (x - mean).transpose() / count).sum();
-    let mut values: Vec<f64> = covariance.symmetric_eigenvalues().iter().map(|value| value.max(0.0)).collect();
+    let mut values: Vec<f64> =
+        covariance.symmetric_eigenvalues().iter().map(|value| value.max(0.0)).collect();
     values.sort_by(f64::total_cmp);
     (values[2].sqrt(), values[1].sqrt())
 }
 
 /// The similarity, and which positions agree with it.
 fn fit(data: &[Located], options: &GeoOptions, seed: Seed) -> Option<(Sim3, Vec<bool>)> {
-    let ransac_options =
-        RansacOptions { max_iterations: options.max_iterations.max(1), min_iterations: 100, ..Default::default() };
+    let ransac_options = RansacOptions {
+        max_iterations: options.max_iterations.max(1),
+        min_iterations: 100,
+        ..Default::default()
+    };
     let mut best: Option<(Sim3, Vec<bool>)> = None;
     // Receivers are often worse than they say: widen until most agree.
     for widening in [1.0, 2.0, 4.0] {

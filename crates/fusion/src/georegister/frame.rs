@@ -20,7 +20,8 @@ pub(super) fn sensible(images: &[RegisteredImage], located: &[Located]) -> Sim3 
     let rotation = UnitQuaternion::rotation_between(&up, &Vector3::z())
         .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
     let centers: Vec<Vector3<f64>> = images.iter().map(|image| image.cam_from_world.center()).collect();
-    let middle = |axis: usize| median(&mut centers.iter().map(|x| x[axis]).collect::<Vec<_>>()).unwrap_or(0.0);
+    let middle =
+        |axis: usize| median(&mut centers.iter().map(|x| x[axis]).collect::<Vec<_>>()).unwrap_or(0.0);
     let origin = Vector3::new(middle(0), middle(1), middle(2));
     let scale = scale(located).unwrap_or(1.0);
     Sim3::new(scale, rotation, -(scale * (rotation * origin)))
@@ -31,7 +32,8 @@ pub(super) fn sensible(images: &[RegisteredImage], located: &[Located]) -> Sim3 
 fn up_direction(images: &[RegisteredImage]) -> Vector3<f64> {
     let count = images.len() as f64;
     let mean = |axis: Vector3<f64>| {
-        images.iter().map(|image| image.cam_from_world.rotation.inverse() * axis).sum::<Vector3<f64>>() / count
+        images.iter().map(|image| image.cam_from_world.rotation.inverse() * axis).sum::<Vector3<f64>>()
+            / count
     };
     let (down, forward) = (mean(Vector3::y()), mean(Vector3::z()));
     let best = if down.norm() >= MIN_AGREEMENT || down.norm() >= forward.norm() { -down } else { -forward };

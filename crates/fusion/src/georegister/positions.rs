@@ -24,7 +24,10 @@ impl EnuOrigin {
 impl LocalPositions {
     /// The position of an image, if it has one.
     pub fn of(&self, image: ImageId) -> Option<&LocalPosition> {
-        self.positions.binary_search_by_key(&image, |position| position.image).ok().map(|at| &self.positions[at])
+        self.positions
+            .binary_search_by_key(&image, |position| position.image)
+            .ok()
+            .map(|at| &self.positions[at])
     }
 }
 

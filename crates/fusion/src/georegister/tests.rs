@@ -122,14 +122,18 @@ fn what_positions_cannot_tell_is_named() {
 fn without_a_reference_up_is_up_and_two_positions_give_the_scale() {
     let (images, positions, truth) = located(0.0, 6);
     let outcome = register(&images, &positions[..1], &GeoOptions::default(), SEED);
-    let GeoOutcome::NotRegistered { frame_from_local, .. } = outcome else { panic!("one position is enough?") };
+    let GeoOutcome::NotRegistered { frame_from_local, .. } = outcome else {
+        panic!("one position is enough?")
+    };
     // The block looks down: up is against the view.
     let up_in_local = truth.rotation.inverse() * Vector3::z();
     let angle = (frame_from_local.rotation * up_in_local).angle(&Vector3::z());
     assert!(angle < 0.2, "{angle} rad");
     let two = [positions[0], positions[59]];
     let outcome = register(&images, &two, &GeoOptions::default(), SEED);
-    let GeoOutcome::NotRegistered { frame_from_local, .. } = outcome else { panic!("two positions are enough?") };
+    let GeoOutcome::NotRegistered { frame_from_local, .. } = outcome else {
+        panic!("two positions are enough?")
+    };
     assert!((frame_from_local.scale / truth.scale - 1.0).abs() < 1e-6);
 }
 
@@ -156,7 +160,8 @@ fn gps(latitude_deg: f64, longitude_deg: f64, altitude_m: Option<f64>) -> Option
 
 #[test]
 fn positions_are_metres_from_their_median() {
-    let table = table(&[gps(47.0, 8.0, Some(500.0)), None, gps(47.001, 8.0, Some(510.0)), gps(46.999, 8.0, None)]);
+    let table =
+        table(&[gps(47.0, 8.0, Some(500.0)), None, gps(47.001, 8.0, Some(510.0)), gps(46.999, 8.0, None)]);
     let local = local_positions(&table).expect("there are positions");
     assert_eq!(local.origin, EnuOrigin { latitude_deg: 47.0, longitude_deg: 8.0, height_m: 510.0 });
     assert_eq!(local.num_without_altitude, 1);
@@ -170,7 +175,8 @@ fn positions_are_metres_from_their_median() {
 
 #[test]
 fn positions_that_cannot_be_true_are_left_out() {
-    let bad = [gps(0.0, 0.0, Some(0.0)), gps(f64::NAN, 8.0, None), gps(95.0, 8.0, None), gps(47.0, 8.0, Some(1e9))];
+    let bad =
+        [gps(0.0, 0.0, Some(0.0)), gps(f64::NAN, 8.0, None), gps(95.0, 8.0, None), gps(47.0, 8.0, Some(1e9))];
     assert!(local_positions(&table(&bad)).is_none());
     let mut mixed = vec![gps(47.0, 8.0, Some(500.0)); 3];
     mixed.extend(bad);

@@ -66,7 +66,9 @@ fn is_near(center: &Vector3<f64>, x_a: &Vector3<f64>, x_b: &Vector3<f64>, option
     let (ray_a, ray_b) = (x_a - center, x_b - center);
     let ratio = ray_a.norm() / ray_b.norm();
     let max_ratio = options.max_depth_ratio.max(1.0);
-    ray_a.angle(&ray_b) <= options.max_angle_deg.to_radians() && ratio <= max_ratio && ratio >= 1.0 / max_ratio
+    ray_a.angle(&ray_b) <= options.max_angle_deg.to_radians()
+        && ratio <= max_ratio
+        && ratio >= 1.0 / max_ratio
 }
 
 /// Pairs of points with common observations, most in common first, ties by the points.

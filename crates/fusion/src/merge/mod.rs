@@ -121,10 +121,14 @@ pub fn merge(
     options: &MergeOptions,
 ) -> MergedComponent {
     let mut report = MergeReport::default();
-    let members: Vec<u32> = placement.components.get(component).map_or(Vec::new(), |found| found.submaps.clone());
+    let members: Vec<u32> =
+        placement.components.get(component).map_or(Vec::new(), |found| found.submaps.clone());
     let images = averages.images.clone();
     let center_of = |image: ImageId| {
-        images.binary_search_by_key(&image, |entry| entry.image).ok().map(|at| images[at].cam_from_world.center())
+        images
+            .binary_search_by_key(&image, |entry| entry.image)
+            .ok()
+            .map(|at| images[at].cam_from_world.center())
     };
     let mut points = Vec::new();
     for submap in &members {

@@ -39,7 +39,10 @@ fn exact_parts_give_the_whole_back() {
     let whole = assemble(&component.cameras, &component.shards);
     // Points that both see are one; points with fewer than two cameras in either part are lost.
     assert!(component.report.num_joined > 100, "{:?}", component.report);
-    assert_eq!(component.report.num_conflicts + component.report.num_too_far + component.report.num_contested, 0);
+    assert_eq!(
+        component.report.num_conflicts + component.report.num_too_far + component.report.num_contested,
+        0
+    );
     assert!(whole.points.len() <= truth.points.len());
     assert!((whole.mean_reprojection_error_px() / truth.mean_reprojection_error_px() - 1.0).abs() < 0.05);
     let params = whole.cameras[0].1.params().iter().zip(truth.cameras[0].1.params());
@@ -54,7 +57,10 @@ fn every_observation_is_owned_once_and_images_are_seen_once_by_a_track() {
         for point in &shard.points {
             let track = shard.track(point);
             assert!(track.len() >= 2);
-            assert!(track.windows(2).all(|pair| pair[0].image < pair[1].image), "an image twice, or out of order");
+            assert!(
+                track.windows(2).all(|pair| pair[0].image < pair[1].image),
+                "an image twice, or out of order"
+            );
             owned.extend(track.iter().map(|seen| (seen.image, seen.feature)));
         }
     }
@@ -103,6 +109,7 @@ fn tracks_that_conflict_stay_apart() {
 
 #[test]
 fn nothing_merges_to_nothing() {
-    let component = merge(&[], &Placement::default(), &CameraAverages::default(), 0, &MergeOptions::default());
+    let component =
+        merge(&[], &Placement::default(), &CameraAverages::default(), 0, &MergeOptions::default());
     assert!(component.shards.is_empty() && component.cameras.images.is_empty());
 }

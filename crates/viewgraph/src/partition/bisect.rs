@@ -249,7 +249,8 @@ impl Pass {
         for side in 0..2 {
             while let Some(top) = self.heaps[side].peek().copied() {
                 let node = top.node as usize;
-                let stale = self.moved[node] || top.gain != self.gain[node] || usize::from(on_right[node]) != side;
+                let stale =
+                    self.moved[node] || top.gain != self.gain[node] || usize::from(on_right[node]) != side;
                 if stale {
                     self.heaps[side].pop();
                     continue;
@@ -274,7 +275,11 @@ fn gain_of(graph: &WeightedGraph, on_right: &[bool], node: u32) -> f64 {
     graph
         .neighbors(node)
         .iter()
-        .map(|(neighbor, weight)| if on_right[*neighbor as usize] == on_right[node as usize] { -weight } else { *weight })
+        .map(
+            |(neighbor, weight)| {
+                if on_right[*neighbor as usize] == on_right[node as usize] { -weight } else { *weight }
+            },
+        )
         .sum()
 }
 

@@ -87,7 +87,10 @@ impl WeightedGraph {
             let mut partner: Option<(u32, f64)> = None;
             for (neighbor, weight) in self.neighbors(node) {
                 let fits = own + u64::from(self.size[*neighbor as usize]) <= max_size;
-                if fits && coarse_of[*neighbor as usize] == FREE && partner.is_none_or(|best| *weight > best.1) {
+                if fits
+                    && coarse_of[*neighbor as usize] == FREE
+                    && partner.is_none_or(|best| *weight > best.1)
+                {
                     partner = Some((*neighbor, *weight));
                 }
             }

@@ -114,7 +114,8 @@ pub fn partition(graph: &ViewGraph, options: &PartitionOptions, seed: Seed) -> P
                 1 => "no verified pair holds it to another image".to_owned(),
                 count => format!("its component has only {count} images"),
             };
-            let left_out = members.iter().map(|node| LeftOut { image: ImageId(*node), reason: reason.clone() });
+            let left_out =
+                members.iter().map(|node| LeftOut { image: ImageId(*node), reason: reason.clone() });
             result.left_out.extend(left_out);
             continue;
         }
@@ -138,7 +139,8 @@ struct Bounds {
 impl Bounds {
     fn new(options: &PartitionOptions) -> Self {
         let max_size = options.max_cluster_size.max(8);
-        let fraction = if options.core_fraction.is_finite() { options.core_fraction.clamp(0.3, 0.9) } else { 0.6 };
+        let fraction =
+            if options.core_fraction.is_finite() { options.core_fraction.clamp(0.3, 0.9) } else { 0.6 };
         Self {
             max_size: max_size as usize,
             core_size: (f64::from(max_size) * fraction).round() as u64,

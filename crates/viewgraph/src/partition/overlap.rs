@@ -35,7 +35,12 @@ pub(super) struct Overlapping {
 
 /// Gives each cluster images of its neighbours: first for seams that hold the component together twice over, then
 /// for the others, strongest first, as long as there is room.
-pub(super) fn grow(graph: &WeightedGraph, part_of: &[u32], num_parts: u32, bounds: OverlapBounds) -> Overlapping {
+pub(super) fn grow(
+    graph: &WeightedGraph,
+    part_of: &[u32],
+    num_parts: u32,
+    bounds: OverlapBounds,
+) -> Overlapping {
     let cut: BTreeMap<(u32, u32), f64> =
         graph.edges_between(part_of).into_iter().map(|(a, b, weight)| ((a, b), weight)).collect();
     let (required, others) = required_seams(num_parts, &cut);

@@ -49,7 +49,11 @@ fn check(graph: &ViewGraph, options: &PartitionOptions, partition: &Partition) {
     let mut cores = 0;
     for (at, cluster) in partition.clusters.iter().enumerate() {
         assert_eq!(cluster.id.index(), at);
-        assert!(cluster.images.len() <= options.max_cluster_size as usize, "cluster of {}", cluster.images.len());
+        assert!(
+            cluster.images.len() <= options.max_cluster_size as usize,
+            "cluster of {}",
+            cluster.images.len()
+        );
         assert!(cluster.images.windows(2).all(|pair| pair[0] < pair[1]));
         cluster.images.iter().for_each(|image| placed[image.index()] += 1);
         cores += cluster.num_core;
@@ -101,7 +105,11 @@ fn an_aerial_block_is_cut_with_strong_cyclic_seams() {
     assert!((1.2..1.7).contains(&partition.report.duplication), "{}", partition.report.duplication);
     for cluster in &partition.clusters {
         let seams = partition.seams.iter().filter(|seam| seam.a == cluster.id || seam.b == cluster.id);
-        assert!(seams.filter(|seam| seam.shared_images.len() >= 8).count() >= 2, "cluster {} hangs loose", cluster.id);
+        assert!(
+            seams.filter(|seam| seam.shared_images.len() >= 8).count() >= 2,
+            "cluster {} hangs loose",
+            cluster.id
+        );
     }
 }
 
