@@ -88,6 +88,7 @@ pub struct SeamEvidence {
 /// What became of a seam.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "verdict")]
+#[expect(clippy::large_enum_variant, reason = "a run has few seams, and most are accepted")]
 pub enum SeamVerdict {
     /// The submaps fit.
     Accepted {
