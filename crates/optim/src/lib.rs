@@ -4,7 +4,11 @@
 //! gives the same bytes for any number of threads: work is cut into fixed parts and sums are folded in index order.
 
 pub mod bundle;
+mod graph;
 pub mod linear;
 mod loss;
+pub mod position_averaging;
+pub mod rotation_averaging;
+pub mod sim3_graph;
 
 pub use loss::Loss;

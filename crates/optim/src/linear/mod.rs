@@ -110,6 +110,12 @@ impl BlockSystem {
         }
     }
 
+    /// A value of the diagonal.
+    pub fn diagonal(&self, block: usize, component: usize) -> f64 {
+        let at = self.pattern.find(block, block);
+        at.map_or(0.0, |at| self.values[self.pattern.value_index(at, block, component) + component])
+    }
+
     /// Factorises; false when the matrix is not positive definite to rounding.
     pub fn factorize(&mut self) -> bool {
         if self.values.iter().any(|v| !v.is_finite()) {
