@@ -2,18 +2,14 @@
 //!
 //! The stages, in the order of a run; each is a pure function of its inputs, its options and a seed:
 //!
-//! ```text
-//! align::align(a: &Reconstruction, b: &Reconstruction, &AlignOptions, Seed) -> SeamOutcome
-//! georegister::local_positions(&ImageTable) -> Option<LocalPositions>
-//! average::place(&[SubmapSummary], &[align::Seam], &[LocalPosition], &PlaceOptions, Seed) -> Placement
-//! average::average_cameras(&[SubmapSummary], &Placement, component: usize, &CameraAverageOptions)
-//!     -> CameraAverages
-//! merge::merge(&[&Reconstruction], &Placement, &CameraAverages, component: usize, &MergeOptions) -> MergedComponent
-//! adjust::adjust(&mut MergedCameras, &mut dyn MergedShards, &AdjustInput, &AdjustOptions)
-//!     -> Result<AdjustReport, FusionError>
-//! georegister::register(&[RegisteredImage], &[LocalPosition], &GeoOptions, Seed) -> GeoOutcome
-//! seams::measure(a: &Reconstruction, b: &Reconstruction, world_from_a: &Sim3, world_from_b: &Sim3) -> SeamFigures
-//! ```
+//! 1. [`align::align`]: two overlapping submaps → a similarity with evidence, or the reason there is none.
+//! 2. [`georegister::local_positions`]: the GPS of the image table → positions in one local ENU frame.
+//! 3. [`average::place`]: all seams and positions → one similarity per submap, solved jointly, wrong seams switched
+//!    off; then [`average::average_cameras`]: one pose per photograph.
+//! 4. [`merge::merge`]: tracks joined across seams, one [`merge::MergedComponent`] per connected component, its
+//!    points in shards by space.
+//! 5. [`adjust::adjust`]: seams first, then the whole, over shards that the caller keeps.
+//! 6. [`seams::measure`]: what a seam shows under a placement; [`georegister::residuals`]: what positions show.
 //!
 //! Submaps are numbered `0..n` by the caller, in one fixed order; everything here speaks of them by that number.
 //! This crate does no I/O and knows no network.

@@ -1,9 +1,10 @@
 //! The graph of verified pairs: build, filter, measure and partition with overlap.
 //!
-//! Photographs are nodes, verified pairs are edges. `ViewGraph::build(num_images: u32, &[PairSummary], &ViewGraphOptions) -> (ViewGraph, ViewGraphReport)` averages the rotations of the whole graph
+//! Photographs are nodes, verified pairs are edges. [`ViewGraph::build`] averages the rotations of the whole graph
 //! and drops what disagrees; [`partition`] cuts what is left into clusters of bounded size whose seams share
 //! photographs. This crate never sees pixels, matches, files or the network.
 
+mod build;
 mod components;
 mod graph;
 mod options;
