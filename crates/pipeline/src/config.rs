@@ -9,6 +9,7 @@ use terrane_frontend::matching::MatchOptions;
 use terrane_frontend::pairs::{BlockOptions, PairOptions};
 use terrane_frontend::retrieval::VocabularyOptions;
 use terrane_frontend::sift::SiftOptions;
+use terrane_frontend::verification::VerificationOptions;
 use terrane_fusion::adjust::AdjustOptions;
 use terrane_fusion::align::AlignOptions;
 use terrane_fusion::average::{CameraAverageOptions, PlaceOptions};
@@ -115,6 +116,8 @@ pub struct PairStageOptions {
 pub struct MatchStageOptions {
     /// Matching of descriptors.
     pub matching: MatchOptions,
+    /// Two-view geometry.
+    pub verification: VerificationOptions,
 }
 
 /// Intrinsics given by the user: `MODEL:parameters`, as `PINHOLE:2759.48,2764.16,1520.69,1006.81`.

@@ -40,6 +40,12 @@ impl SceneError {
         Self(Box::new(Inner::Source { what: what.to_owned(), source: source.into() }))
     }
 
+    /// The error of a place that shards are read from, for implementations of [`crate::Model`];
+    /// [`SceneError::into_source`] gives it back.
+    pub fn from_source(source: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> Self {
+        Self::source_failed("reading a shard", source)
+    }
+
     /// The bytes are not what was written: compute them again.
     pub fn is_corrupt(&self) -> bool {
         matches!(*self.0, Inner::Corrupt(_))

@@ -1,6 +1,13 @@
 //! Execution: one task in, one artefact out.
 
+mod components;
+mod graph;
+mod ingest;
+mod pixels;
 pub(crate) mod read;
+mod report;
+mod shards;
+mod submaps;
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
@@ -8,7 +15,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use terrane_scene::SceneError;
 
-use crate::{PipelineError, Put, RunConfig, Store, Task, TaskError, TaskReport};
+pub(crate) use report::RunReport;
+
+use crate::{PipelineError, Put, RunConfig, Store, Task, TaskError, TaskReport, TaskSpec};
 
 /// Tells tasks to stop. Clones share the signal.
 #[derive(Clone, Debug, Default)]
@@ -96,6 +105,32 @@ pub fn execute(task: &Task, store: &Store, context: &ExecutionContext) -> Result
     }
 }
 
-fn run_stage(task: &Task, _: &Store, _: &ExecutionContext) -> Result<Made, PipelineError> {
-    Err(PipelineError::invalid_input(format!("{} is not a stage of this build", task.stage)))
+fn run_stage(task: &Task, store: &Store, context: &ExecutionContext) -> Result<Made, PipelineError> {
+    match &task.spec {
+        TaskSpec::Ingest { listing } => ingest::ingest(context, listing),
+        TaskSpec::Features { table, first, count } => pixels::features(store, context, table, *first, *count),
+        TaskSpec::Pairs { table, features, lost } => pixels::pairs(store, context, table, features, lost),
+        TaskSpec::Match { table, pairs, block, features } => {
+            pixels::matching(store, context, (table, pairs), *block, features)
+        }
+        TaskSpec::ViewGraph { num_images, matches } => {
+            graph::view_graph(store, context, *num_images, matches)
+        }
+        TaskSpec::Partition { view_graph } => graph::partition(store, context, view_graph),
+        TaskSpec::Submap { .. } => submaps::submap(store, context, &task.spec),
+        TaskSpec::Align { a, b } => submaps::align(store, context, a, b),
+        TaskSpec::Average { table, submaps, seams } => {
+            components::average(store, context, table, submaps, seams)
+        }
+        TaskSpec::Merge { average, submaps, component } => {
+            components::merge(store, context, average, submaps, *component)
+        }
+        TaskSpec::Adjust { table, average, merge, component } => {
+            components::adjust(store, context, table, (average, *component), merge)
+        }
+        TaskSpec::Georegister { table, adjust, component } => {
+            components::georegister(store, context, table, adjust, *component)
+        }
+        TaskSpec::Export { run } => report::export(store, run),
+    }
 }

@@ -74,6 +74,8 @@ pub struct RunFigures {
     pub georeferenced: bool,
     /// RMS distance of cameras from their satellite positions in the largest component, in metres.
     pub gps_rmse_m: Option<f64>,
+    /// Median of these distances, in metres.
+    pub gps_median_m: Option<f64>,
     /// Why nothing could be reconstructed, when nothing could.
     pub nothing: Option<String>,
 }

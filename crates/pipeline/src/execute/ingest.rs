@@ -1,0 +1,89 @@
+//! Ingest: every file once, for its hash and its metadata.
+
+use rayon::prelude::*;
+use terrane_frontend::cameras::{self, GivenCamera};
+use terrane_frontend::metadata::{self, ImageMetadata};
+use terrane_scene::codec::{ArchiveWriter, Kind};
+use terrane_scene::{ImageRecord, ImageTable, RejectedImage};
+
+use super::{ExecutionContext, Made, read};
+use crate::PipelineError;
+use crate::listing::Listing;
+
+/// Files that are in memory together at most, whatever the number of threads: they are read in runs of this length.
+const FILES_AT_ONCE: usize = 16;
+
+struct Usable {
+    path: String,
+    content_hash: String,
+    metadata: ImageMetadata,
+}
+
+pub(super) fn ingest(context: &ExecutionContext, digest: &str) -> Result<Made, PipelineError> {
+    let listing = Listing::scan(&context.config)?;
+    if listing.digest != digest {
+        return Err(PipelineError::storage(
+            "the photographs changed while the run began: it is planned again",
+        ));
+    }
+    let mut usable = Vec::new();
+    let mut rejected = Vec::new();
+    for paths in listing.paths.chunks(FILES_AT_ONCE) {
+        context.cancel.check()?;
+        let read: Vec<Result<Usable, RejectedImage>> =
+            paths.par_iter().map(|path| read_file(context, path)).collect();
+        for outcome in read {
+            match outcome {
+                Ok(file) => usable.push(file),
+                Err(reason) => rejected.push(reason),
+            }
+        }
+    }
+    let table = table(context, usable, rejected)?;
+    let counts = vec![("images", table.images.len() as u64), ("rejected", table.rejected.len() as u64)];
+    let mut archive = ArchiveWriter::new(Kind::Record);
+    archive.json(read::TABLE, 0, &table).map_err(super::encode_error)?;
+    Ok(Made { bytes: archive.finish(), counts })
+}
+
+fn read_file(context: &ExecutionContext, path: &str) -> Result<Usable, RejectedImage> {
+    let reject = |reason: String| RejectedImage { path: path.to_owned(), reason };
+    let bytes = std::fs::read(context.config.photos.join(path))
+        .map_err(|error| reject(format!("the file can't be read ({error})")))?;
+    let metadata = metadata::read(&bytes).map_err(|error| reject(error.to_string()))?;
+    let content_hash = crate::key::hex(blake3::hash(&bytes).as_bytes());
+    Ok(Usable { path: path.to_owned(), content_hash, metadata })
+}
+
+fn table(
+    context: &ExecutionContext,
+    usable: Vec<Usable>,
+    rejected: Vec<RejectedImage>,
+) -> Result<ImageTable, PipelineError> {
+    let given = match &context.config.camera {
+        Some(camera) => Some(
+            GivenCamera::new(camera.model, camera.params.clone())
+                .map_err(|error| PipelineError::invalid_input(error.to_string()))?,
+        ),
+        None => None,
+    };
+    let (hashes, described): (Vec<String>, Vec<(String, ImageMetadata)>) =
+        usable.into_iter().map(|file| (file.content_hash, (file.path, file.metadata))).unzip();
+    let (cameras, camera_of) = cameras::group(&described, given.as_ref());
+    let images = described
+        .into_iter()
+        .zip(hashes)
+        .zip(camera_of)
+        .map(|(((path, metadata), content_hash), camera)| ImageRecord {
+            path,
+            content_hash,
+            camera,
+            width_px: metadata.width_px,
+            height_px: metadata.height_px,
+            orientation: metadata.orientation,
+            gps: metadata.gps,
+            captured_s: metadata.captured_s,
+        })
+        .collect();
+    Ok(ImageTable { cameras, images, rejected })
+}
