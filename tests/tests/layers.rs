@@ -28,8 +28,8 @@ const ALLOWED: &[(&str, &[&str])] = &[
             "object_store",
         ],
     ),
-    ("proto", &["tonic", "prost"]),
-    ("cluster", &["pipeline", "proto", "scene", "tokio", "rayon"]),
+    ("proto", &["tonic", "prost", "tokio"]),
+    ("cluster", &["pipeline", "proto", "tokio"]),
     (
         "cli",
         &[
