@@ -102,9 +102,9 @@ impl Planner for ToyPlanner {
         Ok(Planned { ready, stages: stages.collect(), verdict: open.is_none().then_some(Verdict::Finished) })
     }
 
-    fn close(&mut self, verdict: &Verdict, timings: &RunTimings) -> Result<(), EngineFailure> {
+    fn close(&mut self, verdict: &Verdict, timings: &RunTimings) -> Result<Closing, EngineFailure> {
         self.engine.with(|toy| toy.closed = Some((verdict.clone(), timings.clone())));
-        Ok(())
+        Ok(Closing::Written)
     }
 }
 

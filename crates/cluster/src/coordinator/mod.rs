@@ -18,7 +18,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
 use crate::ClusterError;
-use crate::engine::{Engine, EngineFailure, Planner};
+use crate::engine::{Closing, Engine, EngineFailure, Planner};
 use crate::state::{Event, Planned, Policy, RequestId};
 use log::Log;
 
@@ -41,8 +41,6 @@ impl Default for CoordinatorOptions {
 
 /// What the shell's loop is told.
 enum Command {
-    /// Something happened that nobody waits for.
-    Event(Event),
     /// A worker announces itself.
     Register(WorkerId, Registration, oneshot::Sender<()>),
     /// A worker waits for a task.
@@ -55,6 +53,8 @@ enum Command {
     Submit(RunId, Bytes, Box<dyn Planner>),
     /// A plan is made; the planner comes back.
     Planned(RunId, u64, Result<Planned, EngineFailure>, Option<Box<dyn Planner>>),
+    /// The result is written, or not; the planner comes back.
+    Closed(RunId, Result<Closing, EngineFailure>, Option<Box<dyn Planner>>),
     /// The process of the worker of this name ended.
     Exited(String),
     /// What a run is.

@@ -96,7 +96,6 @@ impl Shell {
 
     fn take(&mut self, command: Command) {
         match command {
-            Command::Event(event) => self.apply(event, Caller::Nobody),
             Command::Register(worker, registration, answer) => {
                 self.names.insert(registration.name.clone(), worker);
                 self.apply(Event::Registered(worker, registration), Caller::Nobody);
@@ -118,6 +117,12 @@ impl Shell {
                     row.planner = planner;
                 }
                 self.apply(Event::Planned(run, number, outcome), Caller::Nobody);
+            }
+            Command::Closed(run, result, planner) => {
+                if let Some(row) = self.runs.get_mut(&run) {
+                    row.planner = planner;
+                }
+                self.apply(Event::Closed(run, result), Caller::Nobody);
             }
             Command::Exited(name) => {
                 if let Some(worker) = self.names.remove(&name) {
@@ -190,10 +195,13 @@ impl Shell {
     fn close(&mut self, run: RunId, verdict: Verdict, timings: RunTimings) {
         let Some(mut planner) = self.runs.get_mut(&run).and_then(|run| run.planner.take()) else { return };
         let handle = self.handle.clone();
-        let closing = tokio::task::spawn_blocking(move || planner.close(&verdict, &timings));
+        let closing = tokio::task::spawn_blocking(move || (planner.close(&verdict, &timings), planner));
         tokio::spawn(async move {
-            let result = closing.await.unwrap_or_else(|_| Err(broken("writing the result")));
-            let _ = handle.tell(Command::Event(Event::Closed(run, result))).await;
+            let (result, planner) = match closing.await {
+                Ok((result, planner)) => (result, Some(planner)),
+                Err(_) => (Err(broken("writing the result")), None),
+            };
+            let _ = handle.tell(Command::Closed(run, result, planner)).await;
         });
     }
 }

@@ -8,7 +8,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use bytes::Bytes;
 use terrane_proto::types::Failure;
 
-pub use crate::state::{EngineFailure, News, Planned, PlannedStage, PlannedTask, RunTimings, Verdict};
+pub use crate::state::{
+    Closing, EngineFailure, News, Planned, PlannedStage, PlannedTask, RunTimings, Verdict,
+};
 pub use photographs::{PipelineEngine, RunDescription};
 
 /// Knows runs by their descriptions. All calls block: they are made on threads that drive no reactor.
@@ -39,7 +41,7 @@ pub trait Planner: Send {
     ///
     /// # Errors
     /// When it can't be written.
-    fn close(&mut self, verdict: &Verdict, timings: &RunTimings) -> Result<(), EngineFailure>;
+    fn close(&mut self, verdict: &Verdict, timings: &RunTimings) -> Result<Closing, EngineFailure>;
 }
 
 /// Executes tasks of one run.

@@ -14,7 +14,7 @@ use terrane_pipeline::{
 use terrane_proto::types::{Failure, FailureKind, TaskKey};
 
 use super::{
-    CancelFlag, Engine, EngineFailure, Executor, News, Planned, PlannedStage, PlannedTask, Planner,
+    CancelFlag, Closing, Engine, EngineFailure, Executor, News, Planned, PlannedStage, PlannedTask, Planner,
     RunTimings, Verdict,
 };
 
@@ -70,9 +70,10 @@ impl Engine for PipelineEngine {
         if !problems.is_empty() {
             return Err(EngineFailure { reason: problems.join("; "), bad_input: true });
         }
+        output::check_writable(&description.out).map_err(failure)?;
         let store = Store::open(&description.store).map_err(failure)?;
         let (known, predicted, reused) = (KnownArtefacts::new(), BTreeMap::new(), BTreeMap::new());
-        Ok(Box::new(RunPlanner { description, store, known, predicted, reused }))
+        Ok(Box::new(RunPlanner { description, store, known, predicted, reused, reopened: 0 }))
     }
 
     fn executor(&self, description: &[u8]) -> Result<Arc<dyn Executor>, EngineFailure> {
@@ -83,6 +84,9 @@ impl Engine for PipelineEngine {
     }
 }
 
+/// A store that keeps breaking what the result needs ends the run after so many tries.
+const MAX_REOPENED: u32 = 8;
+
 struct RunPlanner {
     description: RunDescription,
     store: Store,
@@ -91,6 +95,8 @@ struct RunPlanner {
     predicted: BTreeMap<Stage, u64>,
     /// Tasks of each stage that the first plan to know them found done.
     reused: BTreeMap<Stage, u64>,
+    /// How often the result could not be written for want of an artefact.
+    reopened: u32,
 }
 
 impl RunPlanner {
@@ -190,14 +196,24 @@ impl Planner for RunPlanner {
         self.convert(plan)
     }
 
-    fn close(&mut self, verdict: &Verdict, timings: &RunTimings) -> Result<(), EngineFailure> {
+    fn close(&mut self, verdict: &Verdict, timings: &RunTimings) -> Result<Closing, EngineFailure> {
         let costs = self.costs(timings);
         let RunDescription { config, out, .. } = &self.description;
         match output::write(config, &self.store, &mut self.known, out, &costs) {
-            Ok(()) => Ok(()),
+            Ok(_) => Ok(Closing::Written),
             // A run that never got as far as figures has nothing to write; its reason is told all the same.
-            Err(error) if matches!(verdict, Verdict::FellShort(_)) && error.is_invalid_input() => Ok(()),
-            Err(error) => Err(failure(error)),
+            Err(error) if matches!(verdict, Verdict::FellShort(_)) && error.is_invalid_input() => {
+                Ok(Closing::Written)
+            }
+            Err(error) => match error.broken_artefact() {
+                Some(key) if self.reopened < MAX_REOPENED => {
+                    tracing::warn!(%key, %error, "computing a broken artefact again");
+                    self.reopened += 1;
+                    self.known.discard(&self.store, &key).map_err(failure)?;
+                    Ok(Closing::PlanAgain)
+                }
+                _ => Err(failure(error)),
+            },
         }
     }
 }

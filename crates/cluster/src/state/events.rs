@@ -94,7 +94,7 @@ pub enum Event {
     /// Somebody ends a run.
     Cancelled(RunId),
     /// The result of a run is written, or can't be.
-    Closed(RunId, Result<(), EngineFailure>),
+    Closed(RunId, Result<Closing, EngineFailure>),
     /// The coordinator goes away: nothing more is given out.
     Drain,
     /// Time passes.
@@ -165,6 +165,15 @@ pub enum Verdict {
     Finished,
     /// With less than was asked for, for this reason.
     FellShort(String),
+}
+
+/// What became of writing a result.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Closing {
+    /// It is written.
+    Written,
+    /// An artefact that it needs is corrupt or gone: plan again, so that it is made anew.
+    PlanAgain,
 }
 
 /// Why the engine could not plan or write.

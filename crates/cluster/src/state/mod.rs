@@ -20,7 +20,7 @@ use terrane_proto::types::{
 };
 
 pub use events::{
-    Effect, EngineFailure, Event, News, Planned, PlannedStage, Policy, RequestId, Timestamp, Verdict,
+    Closing, Effect, EngineFailure, Event, News, Planned, PlannedStage, Policy, RequestId, Timestamp, Verdict,
 };
 pub use item::{Done, GaveUp, Item, PlannedTask, Ready, Running, Strikes, Until, Waiting};
 pub use timings::{RunTimings, StageTiming};
@@ -173,11 +173,13 @@ impl State {
         }
     }
 
-    fn closed(&mut self, id: RunId, result: Result<(), EngineFailure>, effects: &mut Vec<Effect>) {
-        let Some(Phase::Closing(verdict)) = self.runs.get(&id).map(|run| run.phase.clone()) else { return };
+    fn closed(&mut self, id: RunId, result: Result<Closing, EngineFailure>, effects: &mut Vec<Effect>) {
+        let Some(run) = self.runs.get_mut(&id) else { return };
+        let Phase::Closing(verdict) = run.phase.clone() else { return };
         let phase = match (result, verdict) {
-            (Ok(()), Verdict::Finished) => RunPhase::Done,
-            (Ok(()), Verdict::FellShort(reason)) => RunPhase::FellShort(reason),
+            (Ok(Closing::PlanAgain), _) => return run.reopen(),
+            (Ok(Closing::Written), Verdict::Finished) => RunPhase::Done,
+            (Ok(Closing::Written), Verdict::FellShort(reason)) => RunPhase::FellShort(reason),
             (Err(failure), _) if failure.bad_input => RunPhase::BadInput(failure.reason),
             (Err(failure), _) => RunPhase::Failed(failure.reason),
         };

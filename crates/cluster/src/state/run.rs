@@ -90,6 +90,12 @@ impl Run {
         Some((self.plans, std::mem::take(&mut self.news)))
     }
 
+    /// Goes back to planning: the result could not be written from what is there.
+    pub(super) fn reopen(&mut self) {
+        self.phase = Phase::Working;
+        self.dirty = true;
+    }
+
     /// Takes a plan in; the verdict when the run is at its end.
     pub(super) fn planned(&mut self, number: u64, plan: Planned, policy: &Policy) -> Option<Verdict> {
         if !self.is_working() || number != self.plans || !self.planning {

@@ -95,7 +95,7 @@ impl World {
             }
         }
         if self.timings.is_some() && self.over.is_none() {
-            self.event(Event::Closed(RUN, Ok(())));
+            self.event(Event::Closed(RUN, Ok(Closing::Written)));
         }
         judged
     }
@@ -322,6 +322,19 @@ fn an_artefact_that_vanished_is_made_again() {
     world.finish(1, &again);
     world.work_off(1);
     assert_eq!(world.over, Some(RunPhase::Done));
+}
+
+#[test]
+fn a_result_that_can_not_be_written_yet_is_planned_again() {
+    let mut state = State::new(Policy::default());
+    state.apply(Timestamp(0), Event::Submitted(RUN));
+    let finished = || Planned { ready: vec![], stages: vec![], verdict: Some(Verdict::Finished) };
+    state.apply(Timestamp(0), Event::Planned(RUN, 1, Ok(finished())));
+    let effects = state.apply(Timestamp(0), Event::Closed(RUN, Ok(Closing::PlanAgain)));
+    assert!(matches!(effects[..], [Effect::Plan(RUN, 2, _)]), "{effects:?}");
+    let again = Planned { ready: vec![task(0, 0, 1)], verdict: None, ..finished() };
+    state.apply(Timestamp(0), Event::Planned(RUN, 2, Ok(again)));
+    assert_eq!(state.phase(RUN), Some(RunPhase::Working));
 }
 
 #[test]
