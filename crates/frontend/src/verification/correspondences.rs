@@ -1,6 +1,8 @@
 //! Matches as points: in pixels and on the plane z = 1 of each camera, best first.
 
-use nalgebra::Vector2;
+use nalgebra::{Matrix3, Vector2};
+use terrane_geometry::Camera;
+use terrane_geometry::two_view::squared_sampson_error;
 use terrane_scene::{CameraRecord, FocalSource, ImagePair, Keypoint, MatchedPair, PairSummary};
 
 use super::models::Geometry;
@@ -20,12 +22,14 @@ pub(super) struct Correspondences {
     is_static: Vec<bool>,
     /// Whether both focal lengths are given or from EXIF.
     pub(super) is_calibrated: bool,
+    /// Which focal lengths are guessed.
+    pub(super) is_guessed: [bool; 2],
     /// The greatest error in pixels.
     pub(super) threshold_px: f64,
     /// The same on the plane z = 1, as the mean of both cameras.
     pub(super) threshold: f64,
     /// Focal lengths and principal points, for fundamental matrices.
-    pub(super) cameras: [terrane_geometry::Camera; 2],
+    pub(super) cameras: [Camera; 2],
 }
 
 impl Correspondences {
@@ -33,7 +37,7 @@ impl Correspondences {
     /// border where most matches move.
     pub(super) fn new(candidate: &Candidate<'_>, options: &VerificationOptions) -> Self {
         let cameras = [candidate.first.camera, candidate.second.camera];
-        let is_trusted = |record: &CameraRecord| record.focal_source != FocalSource::Guess;
+        let is_guessed = cameras.map(|record: &CameraRecord| record.focal_source == FocalSource::Guess);
         let threshold_px = options.max_error_px;
         let mut points = Self {
             matches: Vec::new(),
@@ -42,7 +46,8 @@ impl Correspondences {
             first: Vec::new(),
             second: Vec::new(),
             is_static: Vec::new(),
-            is_calibrated: cameras.iter().all(|record| is_trusted(record)),
+            is_calibrated: is_guessed == [false; 2],
+            is_guessed,
             threshold_px,
             threshold: cameras
                 .iter()
@@ -75,7 +80,7 @@ impl Correspondences {
         if !(finite(&a) && finite(&b)) {
             return;
         }
-        let in_border = |camera: &terrane_geometry::Camera, point: &Vector2<f64>| {
+        let in_border = |camera: &Camera, point: &Vector2<f64>| {
             let (width, height) = (f64::from(camera.width_px), f64::from(camera.height_px));
             let margin = border * width.hypot(height);
             point.x < margin || point.y < margin || point.x > width - margin || point.y > height - margin
@@ -111,6 +116,26 @@ impl Correspondences {
         self.matches.len()
     }
 
+    /// At most `count` correspondences, evenly spread over the order of quality, ascending.
+    pub(super) fn spread(&self, count: usize) -> Vec<u32> {
+        spread(self.len(), count).map(|i| i as u32).collect()
+    }
+
+    /// Correspondences that agree with a matrix on the plane z = 1, ascending.
+    pub(super) fn within(&self, matrix: &Matrix3<f64>) -> Vec<u32> {
+        let limit = self.threshold * self.threshold;
+        let agrees = |&i: &usize| squared_sampson_error(matrix, &self.first[i], &self.second[i]) < limit;
+        (0..self.len()).filter(agrees).map(|i| i as u32).collect()
+    }
+
+    /// Correspondences that agree with a matrix in pixels, ascending.
+    pub(super) fn within_px(&self, matrix: &Matrix3<f64>) -> Vec<u32> {
+        let limit = self.threshold_px * self.threshold_px;
+        let agrees =
+            |&i: &usize| squared_sampson_error(matrix, &self.first_px[i], &self.second_px[i]) < limit;
+        (0..self.len()).filter(agrees).map(|i| i as u32).collect()
+    }
+
     /// How many of these stay at their place in the border.
     pub(super) fn num_static(&self, indices: &[u32]) -> usize {
         indices.iter().filter(|&&i| self.is_static[i as usize]).count()
@@ -130,4 +155,10 @@ impl Correspondences {
         };
         MatchedPair { summary, matches }
     }
+}
+
+/// At most `count` of `len` places, evenly spread.
+pub(super) fn spread(len: usize, count: usize) -> impl Iterator<Item = usize> {
+    let taken = len.min(count);
+    (0..taken).map(move |at| at * len / taken)
 }

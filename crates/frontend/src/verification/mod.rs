@@ -6,6 +6,7 @@
 
 mod correspondences;
 mod models;
+mod pose;
 #[cfg(test)]
 mod tests;
 

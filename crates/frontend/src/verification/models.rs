@@ -1,16 +1,21 @@
-//! Which two-view geometry explains the matches, and the pose that follows.
+//! Which two-view geometry explains the matches.
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector2, Vector3};
 use terrane_geometry::ransac::RansacOptions;
-use terrane_geometry::two_view::{self, essential_from_pose, parallax_angle_rad, squared_sampson_error};
+use terrane_geometry::two_view;
 use terrane_geometry::{Camera, Rigid3, Seed};
 use terrane_scene::PairKind;
 
 use super::VerificationOptions;
 use super::correspondences::Correspondences;
+use super::pose::{self, PoseEstimate};
 
 /// Most samples of a model that matters only when nearly all of the inliers agree with it.
 const MAX_SAMPLES_OF_INLIERS: u32 = 100;
+
+/// Sampling looks at no more than this many matches, evenly spread over their order of quality. Inliers are then taken from
+/// all of them.
+const MAX_SAMPLED_MATCHES: usize = 1500;
 
 /// What was found. Indices into the correspondences.
 pub(super) struct Geometry {
@@ -20,10 +25,11 @@ pub(super) struct Geometry {
     pub(super) median_angle_rad: f64,
 }
 
-/// The most that agrees with an epipolar geometry.
+/// The most that agrees with an epipolar geometry. Matrices are on the plane z = 1.
 struct Epipolar {
-    /// On the plane z = 1: of rank two, near an essential matrix.
     essential: Option<Matrix3<f64>>,
+    /// Of rank two; an essential matrix only as far as the intrinsics hold.
+    fundamental: Option<Matrix3<f64>>,
     inliers: Vec<u32>,
     /// Whether the inliers are those of the essential matrix.
     by_essential: bool,
@@ -33,7 +39,7 @@ struct Epipolar {
 /// there are few inliers.
 pub(super) fn choose(points: &Correspondences, options: &VerificationOptions, seed: Seed) -> Geometry {
     let epipolar = epipolar(points, options, seed);
-    let inner = Subset::new(points, &epipolar.inliers);
+    let inner = Subset::new(points, epipolar.inliers.clone());
     let share = |count: usize, of: usize, share: f64| of > 0 && count as f64 >= share * of as f64;
     let num_inliers = epipolar.inliers.len();
 
@@ -54,57 +60,27 @@ pub(super) fn choose(points: &Correspondences, options: &VerificationOptions, se
         (None, true) => PairKind::Calibrated,
         (None, false) => PairKind::Uncalibrated,
     };
-    with_pose(points, kind, &epipolar, planar)
+    with_pose(points, kind, epipolar, planar)
 }
 
-/// The better of essential and fundamental matrix. Guessed intrinsics may be far off, so the fundamental matrix then counts
-/// as soon as it explains more.
+/// The better of essential and fundamental matrix. With trusted intrinsics the fundamental matrix must explain clearly more;
+/// guessed ones may be far off, so the one that explains more counts.
 fn epipolar(points: &Correspondences, options: &VerificationOptions, seed: Seed) -> Epipolar {
-    let essential = two_view::estimate_essential(
-        &points.first,
-        &points.second,
-        points.threshold,
-        &options.ransac,
-        seed.derive("essential"),
-    );
-    let num_essential = essential.as_ref().map_or(0, |found| found.inliers.len());
-    let is_clear = num_essential as f64 >= options.min_essential_share * points.len() as f64;
-    let fundamental = if is_clear { None } else { fundamental(points, options, seed) };
-    match (essential, fundamental) {
-        (Some(essential), Some((fundamental, inliers))) => {
-            let enough = options.min_essential_share * inliers.len() as f64;
-            if num_essential as f64 >= enough {
-                Epipolar { essential: Some(essential.model), inliers: essential.inliers, by_essential: true }
-            } else {
-                // Intrinsics that do not fit still make the better pose when they are all that was fitted.
-                Epipolar { essential: Some(fundamental), inliers, by_essential: false }
-            }
-        }
-        (Some(essential), None) => {
-            Epipolar { essential: Some(essential.model), inliers: essential.inliers, by_essential: true }
-        }
-        (None, Some((fundamental, inliers))) => {
-            Epipolar { essential: Some(fundamental), inliers, by_essential: false }
-        }
-        (None, None) => Epipolar { essential: None, inliers: Vec::new(), by_essential: false },
-    }
-}
-
-/// The fundamental matrix in pixels, carried to the plane z = 1, and its inliers.
-fn fundamental(
-    points: &Correspondences,
-    options: &VerificationOptions,
-    seed: Seed,
-) -> Option<(Matrix3<f64>, Vec<u32>)> {
-    let found = two_view::estimate_fundamental(
-        &points.first_px,
-        &points.second_px,
-        points.threshold_px,
-        &options.ransac,
-        seed.derive("fundamental"),
-    )?;
+    let sampled = points.spread(MAX_SAMPLED_MATCHES);
+    let sample = Subset::new(points, sampled);
+    let essential = sample.essential(points, options, seed);
+    let by_essential = essential.map(|e| points.within(&e)).unwrap_or_default();
+    let share = if points.is_calibrated { options.min_essential_share } else { 1.0 };
+    let is_clear = points.is_calibrated && by_essential.len() as f64 >= share * points.len() as f64;
+    let fundamental = if is_clear { None } else { sample.fundamental(points, options, seed) };
+    let by_fundamental = fundamental.map(|f| points.within_px(&f)).unwrap_or_default();
     let [first, second] = points.cameras.map(|camera| intrinsic_matrix(&camera));
-    Some((second.transpose() * found.model * first, found.inliers))
+    let fundamental = fundamental.map(|f| second.transpose() * f * first);
+    if by_essential.len() as f64 >= share * by_fundamental.len() as f64 {
+        Epipolar { essential, fundamental, inliers: by_essential, by_essential: true }
+    } else {
+        Epipolar { essential, fundamental, inliers: by_fundamental, by_essential: false }
+    }
 }
 
 /// The matrix that takes points of the plane z = 1 to pixels, without distortion.
@@ -113,17 +89,18 @@ fn intrinsic_matrix(camera: &Camera) -> Matrix3<f64> {
     Matrix3::new(focal.x, 0.0, center.x, 0.0, focal.y, center.y, 0.0, 0.0, 1.0)
 }
 
-/// The inliers of the epipolar geometry as points of their own.
-struct Subset<'a> {
-    indices: &'a [u32],
+/// Some of the correspondences as points of their own.
+struct Subset {
+    indices: Vec<u32>,
     first: Vec<Vector2<f64>>,
     second: Vec<Vector2<f64>>,
 }
 
-impl<'a> Subset<'a> {
-    fn new(points: &Correspondences, indices: &'a [u32]) -> Self {
+impl Subset {
+    fn new(points: &Correspondences, indices: Vec<u32>) -> Self {
         let pick = |from: &[Vector2<f64>]| indices.iter().map(|&i| from[i as usize]).collect();
-        Self { indices, first: pick(&points.first), second: pick(&points.second) }
+        let (first, second) = (pick(&points.first), pick(&points.second));
+        Self { indices, first, second }
     }
 
     fn ransac(&self, options: &VerificationOptions) -> RansacOptions {
@@ -134,6 +111,31 @@ impl<'a> Subset<'a> {
     /// Indices into the correspondences of indices into this subset.
     fn outer(&self, indices: &[u32]) -> Vec<u32> {
         indices.iter().map(|&i| self.indices[i as usize]).collect()
+    }
+
+    fn essential(
+        &self,
+        points: &Correspondences,
+        options: &VerificationOptions,
+        seed: Seed,
+    ) -> Option<Matrix3<f64>> {
+        let (limit, seed) = (points.threshold, seed.derive("essential"));
+        let found = two_view::estimate_essential(&self.first, &self.second, limit, &options.ransac, seed)?;
+        Some(found.model)
+    }
+
+    /// In pixels.
+    fn fundamental(
+        &self,
+        points: &Correspondences,
+        options: &VerificationOptions,
+        seed: Seed,
+    ) -> Option<Matrix3<f64>> {
+        let pick = |from: &[Vector2<f64>]| self.indices.iter().map(|&i| from[i as usize]).collect::<Vec<_>>();
+        let (first, second) = (pick(&points.first_px), pick(&points.second_px));
+        let (limit, seed) = (points.threshold_px, seed.derive("fundamental"));
+        let found = two_view::estimate_fundamental(&first, &second, limit, &options.ransac, seed)?;
+        Some(found.model)
     }
 
     fn rotation(
@@ -164,78 +166,26 @@ fn without_baseline(kind: PairKind, inliers: Vec<u32>, second_from_first: Option
     Geometry { kind, inliers, second_from_first, median_angle_rad: 0.0 }
 }
 
-/// The pose that most inliers agree with, of those that the models allow, refined.
-///
-/// A plane leaves two poses, and an essential matrix fitted to a plane may be either or neither: all are refined on the same
-/// inliers and compared by their truncated Sampson errors. Where the essential matrix holds, inliers are then taken anew, and
-/// matches whose rays meet behind a camera are left out.
+/// Adds the pose. Where the essential matrix holds, inliers are then taken anew, and matches whose rays meet behind a camera
+/// are left out.
 fn with_pose(
     points: &Correspondences,
     kind: PairKind,
-    epipolar: &Epipolar,
+    epipolar: Epipolar,
     planar: Option<(Matrix3<f64>, Vec<u32>)>,
 ) -> Geometry {
-    let mut starts: Vec<Rigid3> = Vec::new();
-    if let Some(essential) = &epipolar.essential {
-        let pose = two_view::pose_from_essential(essential, &points.first, &points.second, &epipolar.inliers);
-        starts.extend(pose.map(|pose| pose.second_from_first));
-    }
-    if let Some((homography, agreeing)) = &planar {
-        let poses = two_view::poses_from_homography(homography, &points.first, &points.second, agreeing);
-        starts.extend(poses.iter().map(|pose| pose.second_from_first));
-    }
-    let refine = |start: &Rigid3| {
-        two_view::refine_relative_pose(
-            start,
-            &points.first,
-            &points.second,
-            &epipolar.inliers,
-            points.threshold / 2.0,
-        )
+    let estimate = PoseEstimate {
+        points,
+        inliers: &epipolar.inliers,
+        essential: epipolar.essential,
+        fundamental: epipolar.fundamental,
+        homography: planar.as_ref().map(|(homography, agreeing)| (homography, agreeing.as_slice())),
     };
-    let scored = starts.iter().map(refine).map(|pose| (cost(points, &pose, &epipolar.inliers), pose));
-    let best = scored.min_by(|a, b| a.0.total_cmp(&b.0)).map(|scored| scored.1);
-    let Some(pose) = best else {
-        return without_baseline(kind, epipolar.inliers.clone(), None);
+    let Some(found) = pose::best(&estimate) else {
+        return without_baseline(kind, epipolar.inliers, None);
     };
-    let inliers = if epipolar.by_essential { agreeing(points, &pose) } else { epipolar.inliers.clone() };
-    let mut angles: Vec<f64> = inliers
-        .iter()
-        .map(|&i| parallax_angle_rad(&pose.rotation, &points.first[i as usize], &points.second[i as usize]))
-        .collect();
-    angles.sort_by(f64::total_cmp);
-    let median_angle_rad = angles.get(angles.len() / 2).copied().unwrap_or(0.0);
-    Geometry { kind, inliers, second_from_first: Some(pose), median_angle_rad }
-}
-
-/// Sum of squared Sampson errors, cut off at the threshold; a match behind a camera costs as much as an outlier.
-fn cost(points: &Correspondences, pose: &Rigid3, indices: &[u32]) -> f64 {
-    let (essential, limit) = (essential_from_pose(pose), points.threshold * points.threshold);
-    let of_match = |&i: &u32| {
-        let (a, b) = (&points.first[i as usize], &points.second[i as usize]);
-        let error = squared_sampson_error(&essential, a, b);
-        if error < limit && !is_behind(pose, a, b, points.threshold) { error } else { limit }
-    };
-    indices.iter().map(of_match).sum()
-}
-
-/// Correspondences that agree with a pose, ascending.
-fn agreeing(points: &Correspondences, pose: &Rigid3) -> Vec<u32> {
-    let (essential, limit) = (essential_from_pose(pose), points.threshold * points.threshold);
-    let agrees = |i: usize| {
-        let (a, b) = (&points.first[i], &points.second[i]);
-        squared_sampson_error(&essential, a, b) < limit && !is_behind(pose, a, b, points.threshold)
-    };
-    (0..points.len()).filter(|&i| agrees(i)).map(|i| i as u32).collect()
-}
-
-/// Whether the rays of a correspondence surely meet behind a camera: rays that are parallel within the noise may meet anywhere.
-fn is_behind(pose: &Rigid3, first: &Vector2<f64>, second: &Vector2<f64>, noise: f64) -> bool {
-    // λ_second b = λ_first a + t; crossing with b and with a leaves each depth times |a × b|².
-    let (a, b) = (pose.rotation * first.push(1.0), second.push(1.0));
-    let normal = a.cross(&b);
-    let depth_first = -pose.translation.cross(&b).dot(&normal);
-    let depth_second = -pose.translation.cross(&a).dot(&normal);
-    let is_parallel = normal.norm_squared() <= noise * noise * a.norm_squared() * b.norm_squared();
-    !is_parallel && (depth_first < 0.0 || depth_second < 0.0)
+    let is_metric = points.is_calibrated && epipolar.by_essential;
+    let inliers = if is_metric { found.agreeing(points) } else { epipolar.inliers };
+    let median_angle_rad = found.median_angle_rad(points, &inliers);
+    Geometry { kind, inliers, second_from_first: Some(found.second_from_first), median_angle_rad }
 }
