@@ -6,7 +6,7 @@
 mod format;
 mod jpeg;
 mod png;
-#[cfg(any())]
+#[cfg(test)]
 mod tests;
 mod tiff;
 

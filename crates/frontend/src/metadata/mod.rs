@@ -3,7 +3,7 @@
 //! EXIF is a hint, never a condition: a file with broken metadata is used without them, and a note says so.
 
 mod gps;
-#[cfg(any())]
+#[cfg(test)]
 mod tests;
 
 use std::io::Cursor;

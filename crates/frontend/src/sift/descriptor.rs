@@ -31,13 +31,18 @@ pub(super) fn orientations(isa: Isa, place: &Place<'_>, limit: usize) -> Vec<f32
             let before = histogram[(k + ORIENTATION_BINS - 1) % ORIENTATION_BINS];
             let after = histogram[(k + 1) % ORIENTATION_BINS];
             let value = histogram[k];
-            if !(value > before && value > after && value >= PEAK_SHARE * highest) {
+            // Not `> after`: two level bins are one peak.
+            if !(value > before && value >= after && value >= PEAK_SHARE * highest) {
                 return None;
             }
             let shift = 0.5 * (before - after) / (before + after - 2.0 * value);
             Some((value, k as f32 + 0.5 + shift))
         })
         .collect();
+    if peaks.is_empty() {
+        // Wholly symmetric: any direction is as good.
+        return vec![0.0];
+    }
     // Stable: equal peaks stay in the order of their bins.
     peaks.sort_by(|a, b| b.0.total_cmp(&a.0));
     peaks.truncate(limit);

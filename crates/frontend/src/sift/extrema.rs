@@ -84,7 +84,7 @@ impl Detector {
             mark_extrema(isa, differences[s].row(y), bounds, threshold, &mut self.marks);
             for x in marked(&self.marks, size.width) {
                 let cell = Cell { x, y, s };
-                if is_strict_extremum(differences, cell) {
+                if is_extremum(differences, cell) {
                     found.extend(self.refine(differences, size, cell));
                 }
             }
@@ -101,23 +101,27 @@ impl Detector {
 
     fn refine(&self, differences: &[RowRing], size: Size, start: Cell) -> Option<Extremum> {
         let mut cell = start;
-        let mut fit = fit(differences, cell)?;
+        let mut values = neighborhood_of(differences, cell);
+        let mut fit = fit(&values)?;
         for _ in 0..MAX_MOVES {
-            let Some(next) = neighbor(cell, &fit.offset, size, start.y) else { break };
+            let next = neighbor(cell, &fit.offset, size, start.y);
             if next == cell {
                 break;
             }
             cell = next;
-            fit = self::fit(differences, cell)?;
+            values = neighborhood_of(differences, cell);
+            fit = self::fit(&values)?;
         }
         let is_near = fit.offset.iter().all(|o| o.abs() < 1.0);
         if !is_near || fit.value.abs() < self.contrast || !(0.0..self.edge_bound).contains(&fit.edge_ratio) {
             return None;
         }
-        let s = cell.s as f64 + fit.offset[2];
+        let [dx, dy, ds] = fit.offset;
+        let [dx, dy] = unbiased_place(&values, ds).unwrap_or([dx, dy]);
+        let s = cell.s as f64 + ds;
         Some(Extremum {
-            x: (cell.x as f64 + fit.offset[0]) as f32,
-            y: (cell.y as f64 + fit.offset[1]) as f32,
+            x: (cell.x as f64 + dx) as f32,
+            y: (cell.y as f64 + dy) as f32,
             sigma: sigma_of_level(s) as f32,
             level: (s.round() as i64).clamp(1, LEVELS as i64) as u8,
             response: fit.value.abs() as f32,
@@ -135,62 +139,93 @@ fn marked(marks: &[u8], width: usize) -> impl Iterator<Item = usize> + '_ {
         .filter(move |&x| x >= 1 && x + 1 < width)
 }
 
-/// Beyond all of its 26 neighbours, not level with one.
-fn is_strict_extremum(differences: &[RowRing], Cell { x, y, s }: Cell) -> bool {
-    let value = differences[s].row(y)[x];
-    let mut neighbors = (s - 1..=s + 1)
-        .flat_map(|ds| (y - 1..=y + 1).flat_map(move |dy| (x - 1..=x + 1).map(move |dx| (ds, dy, dx))));
-    neighbors.all(|(ds, dy, dx)| {
-        let other = differences[ds].row(dy)[dx];
-        (ds, dy, dx) == (s, y, x) || if value > 0.0 { value > other } else { value < other }
-    })
+/// Beyond all of its 26 neighbours. Of level neighbours the first one is the extremum, so that a blob midway between
+/// pixels is found once.
+fn is_extremum(differences: &[RowRing], cell: Cell) -> bool {
+    let values = neighborhood_of(differences, cell);
+    let values = values.as_flattened().as_flattened();
+    let sign = values[13].signum();
+    let value = sign * values[13];
+    values[..13].iter().all(|v| value > sign * v) && values[14..].iter().all(|v| value >= sign * v)
 }
 
-/// The neighbour that the extremum of the fit lies in, or `None` when it is out of reach.
-fn neighbor(cell: Cell, offset: &[f64; 3], size: Size, start_y: usize) -> Option<Cell> {
-    let step = |o: f64| {
-        if o > 0.6 {
-            1_isize
-        } else if o < -0.6 {
-            -1
+/// The neighbour that the extremum of a fit lies in, as far as it can be reached.
+fn neighbor(cell: Cell, offset: &[f64; 3], size: Size, start_y: usize) -> Cell {
+    let moved = |at: usize, offset: f64, low: usize, high: usize| {
+        let to = if offset > 0.6 {
+            at + 1
+        } else if offset < -0.6 {
+            at - 1
         } else {
-            0
-        }
-    };
-    let moved = |at: usize, o: f64, low: usize, high: usize| {
-        (at as isize + step(o)).clamp(low as isize, high as isize) as usize
+            at
+        };
+        to.clamp(low, high)
     };
     let reach = Detector::REACH - 1;
-    let low_y = start_y.saturating_sub(reach).max(1);
-    Some(Cell {
+    let (low_y, high_y) = (start_y.saturating_sub(reach).max(1), (start_y + reach).min(size.height - 2));
+    Cell {
         x: moved(cell.x, offset[0], 1, size.width - 2),
-        y: moved(cell.y, offset[1], low_y, (start_y + reach).min(size.height - 2)),
+        y: moved(cell.y, offset[1], low_y, high_y),
         s: moved(cell.s, offset[2], 1, LEVELS),
+    }
+}
+
+/// A cell and its 26 neighbours, by level, row and column.
+type Neighborhood = [[[f64; 3]; 3]; 3];
+
+fn neighborhood_of(differences: &[RowRing], Cell { x, y, s }: Cell) -> Neighborhood {
+    std::array::from_fn(|ds| {
+        std::array::from_fn(|dy| {
+            let row = differences[s + ds - 1].row(y + dy - 1);
+            std::array::from_fn(|dx| f64::from(row[x + dx - 1]))
+        })
     })
 }
 
-/// The paraboloid through a cell and its neighbours; `None` when it has no single extremum.
-fn fit(differences: &[RowRing], Cell { x, y, s }: Cell) -> Option<Fit> {
-    let at = |dx: isize, dy: isize, ds: isize| {
-        let row = differences[s.wrapping_add_signed(ds)].row(y.wrapping_add_signed(dy));
-        f64::from(row[x.wrapping_add_signed(dx)])
-    };
-    let center = at(0, 0, 0);
+/// The paraboloid with the cell's first and second differences; `None` when it has no single extremum.
+fn fit(values: &Neighborhood) -> Option<Fit> {
+    let at = |dx: usize, dy: usize, ds: usize| values[ds][dy][dx];
+    let center = at(1, 1, 1);
     let gradient = [
-        0.5 * (at(1, 0, 0) - at(-1, 0, 0)),
-        0.5 * (at(0, 1, 0) - at(0, -1, 0)),
-        0.5 * (at(0, 0, 1) - at(0, 0, -1)),
+        0.5 * (at(2, 1, 1) - at(0, 1, 1)),
+        0.5 * (at(1, 2, 1) - at(1, 0, 1)),
+        0.5 * (at(1, 1, 2) - at(1, 1, 0)),
     ];
-    let xx = at(1, 0, 0) + at(-1, 0, 0) - 2.0 * center;
-    let yy = at(0, 1, 0) + at(0, -1, 0) - 2.0 * center;
-    let ss = at(0, 0, 1) + at(0, 0, -1) - 2.0 * center;
-    let xy = 0.25 * (at(1, 1, 0) + at(-1, -1, 0) - at(-1, 1, 0) - at(1, -1, 0));
-    let xs = 0.25 * (at(1, 0, 1) + at(-1, 0, -1) - at(-1, 0, 1) - at(1, 0, -1));
-    let ys = 0.25 * (at(0, 1, 1) + at(0, -1, -1) - at(0, -1, 1) - at(0, 1, -1));
+    let xx = at(2, 1, 1) + at(0, 1, 1) - 2.0 * center;
+    let yy = at(1, 2, 1) + at(1, 0, 1) - 2.0 * center;
+    let ss = at(1, 1, 2) + at(1, 1, 0) - 2.0 * center;
+    let xy = 0.25 * (at(2, 2, 1) + at(0, 0, 1) - at(0, 2, 1) - at(2, 0, 1));
+    let xs = 0.25 * (at(2, 1, 2) + at(0, 1, 0) - at(0, 1, 2) - at(2, 1, 0));
+    let ys = 0.25 * (at(1, 2, 2) + at(1, 0, 0) - at(1, 0, 2) - at(1, 2, 0));
     let offset = solve_symmetric([xx, xy, xs, yy, ys, ss], gradient)?;
     let slope: f64 = gradient.iter().zip(&offset).map(|(g, o)| g * o).sum();
     let (trace, determinant) = (xx + yy, xx * yy - xy * xy);
     Some(Fit { offset, value: center + 0.5 * slope, edge_ratio: trace * trace / determinant })
+}
+
+/// The column and row of the extremum, from its level and without the bias of a paraboloid.
+///
+/// The differences are interpolated to the level first, for blobs are wider in coarser levels and one paraboloid in
+/// three dimensions has no term for that. Around a blob's centre they fall as 1 - 2u + 3/2 u² with the squared distance u;
+/// their fourth root falls as 1 - u/2 and has no term in u², so that a paraboloid fits it to the next order. `None` where
+/// a neighbour is near or beyond zero, as across a ridge.
+fn unbiased_place(values: &Neighborhood, level_offset: f64) -> Option<[f64; 2]> {
+    let t = level_offset;
+    let weights = [0.5 * t * (t - 1.0), 1.0 - t * t, 0.5 * t * (t + 1.0)];
+    let plane: [[f64; 3]; 3] = std::array::from_fn(|dy| {
+        std::array::from_fn(|dx| (0..3).map(|ds| weights[ds] * values[ds][dy][dx]).sum::<f64>())
+    });
+    let shares = plane.map(|row| row.map(|value| value / plane[1][1]));
+    if shares.as_flattened().iter().any(|share| !(*share > 0.1)) {
+        return None;
+    }
+    let v = shares.map(|row| row.map(|share| share.sqrt().sqrt()));
+    let (gx, gy) = (0.5 * (v[1][2] - v[1][0]), 0.5 * (v[2][1] - v[0][1]));
+    let (xx, yy) = (v[1][2] + v[1][0] - 2.0 * v[1][1], v[2][1] + v[0][1] - 2.0 * v[1][1]);
+    let xy = 0.25 * (v[2][2] + v[0][0] - v[2][0] - v[0][2]);
+    let determinant = xx * yy - xy * xy;
+    let place = [(xy * gy - yy * gx) / determinant, (xy * gx - xx * gy) / determinant];
+    (determinant > 0.0 && place.iter().all(|offset| offset.abs() < 1.0)).then_some(place)
 }
 
 /// Solves `[[a, b, c], [b, d, e], [c, e, f]] x = -g` by Cramer's rule.

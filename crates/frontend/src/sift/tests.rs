@@ -1,1 +1,259 @@
-//! Features of images with known answers.
+//! Features of images with known answers: blobs at known places, textures under known transforms.
+
+use terrane_scene::{Features, Keypoint};
+
+use super::*;
+
+/// A sum of Gaussian blobs on grey, which can be drawn exactly at any place, scale and rotation.
+struct Scene {
+    background: f64,
+    blobs: Vec<[f64; 4]>, // x, y, sigma, height
+}
+
+impl Scene {
+    fn random(count: usize, side: f64, seed: u64) -> Self {
+        let mut state = seed;
+        let mut uniform = move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 33) as f64 / f64::from(1_u32 << 31)
+        };
+        let blobs = (0..count).map(|_| {
+            let (x, y, height) = (uniform() * side, uniform() * side, (uniform() - 0.5) * 120.0);
+            [x, y, 1.2 * 8.0_f64.powf(uniform() * uniform()), height]
+        });
+        Self { background: 128.0, blobs: blobs.collect() }
+    }
+
+    /// Draws what `image_from_scene` (rotation and scale as a complex number, then a shift) makes of the scene.
+    fn draw(&self, width: usize, height: usize, rotation: (f64, f64), shift: (f64, f64)) -> GrayImage {
+        let scale = rotation.0.hypot(rotation.1);
+        let mut values = vec![self.background; width * height];
+        for &[x, y, sigma, top] in &self.blobs {
+            let (cx, cy) = transformed((x, y), rotation, shift);
+            let sigma = sigma * scale;
+            let rows = ((cy - 5.0 * sigma).max(0.0) as usize)..((cy + 5.0 * sigma).max(0.0) as usize).min(height);
+            for row in rows {
+                let columns = ((cx - 5.0 * sigma).max(0.0) as usize)..((cx + 5.0 * sigma).max(0.0) as usize).min(width);
+                for column in columns {
+                    let (dx, dy) = (column as f64 + 0.5 - cx, row as f64 + 0.5 - cy);
+                    values[row * width + column] += top * (-(dx * dx + dy * dy) / (2.0 * sigma * sigma)).exp();
+                }
+            }
+        }
+        let data = values.into_iter().map(|v| v.round().clamp(0.0, 255.0) as u8).collect();
+        GrayImage { width, height, data }
+    }
+}
+
+fn transformed((x, y): (f64, f64), (c, s): (f64, f64), (dx, dy): (f64, f64)) -> (f64, f64) {
+    (c * x - s * y + dx, s * x + c * y + dy)
+}
+
+fn options(first_octave: FirstOctave) -> SiftOptions {
+    SiftOptions { first_octave, ..SiftOptions::default() }
+}
+
+#[test]
+fn blobs_are_found_where_they_are_in_every_octave() {
+    let cases = [
+        // The finest blobs are as small as pixels: their samples are no blob any more.
+        (FirstOctave::Doubled, 1.2, 0.015),
+        (FirstOctave::Doubled, 1.6, 0.006),
+        (FirstOctave::Doubled, 2.3, 0.005),
+        (FirstOctave::Original, 2.3, 0.005),
+        (FirstOctave::Original, 3.1, 0.005),
+        (FirstOctave::Original, 4.6, 0.005),
+        (FirstOctave::Original, 6.0, 0.005),
+        (FirstOctave::Original, 9.3, 0.005),
+        (FirstOctave::Doubled, 9.3, 0.005),
+    ];
+    for (first_octave, sigma, bound) in cases {
+        for (x, y) in [(80.5, 77.0), (80.13, 76.84), (79.71, 77.36), (81.0, 78.25), (82.6, 79.9)] {
+            let scene = Scene { background: 30.0, blobs: vec![[x, y, sigma, 200.0]] };
+            let image = scene.draw(161, 150, (1.0, 0.0), (0.0, 0.0));
+            let features = extract(&image, None, &options(first_octave));
+            let strongest = features.keypoints.first().expect("a blob is a feature");
+            let error = (f64::from(strongest.x_px) - x).hypot(f64::from(strongest.y_px) - y);
+            assert!(error < bound, "{first_octave:?} sigma {sigma}: {error} px away from ({x}, {y})");
+            let ratio = f64::from(strongest.scale_px) / sigma;
+            assert!((0.8..1.05).contains(&ratio), "{first_octave:?} sigma {sigma}: scale {}", strongest.scale_px);
+        }
+    }
+}
+
+#[test]
+fn octave_minus_one_finds_blobs_that_octave_zero_is_too_coarse_for() {
+    let scene = Scene { background: 30.0, blobs: vec![[40.3, 40.8, 1.3, 200.0]] };
+    let image = scene.draw(80, 80, (1.0, 0.0), (0.0, 0.0));
+    let near = |features: &Features| {
+        features.keypoints.iter().filter(|k| (k.x_px - 40.3).hypot(k.y_px - 40.8) < 0.05).count()
+    };
+    assert!(near(&extract(&image, None, &options(FirstOctave::Doubled))) >= 1);
+    assert_eq!(near(&extract(&image, None, &options(FirstOctave::Original))), 0);
+}
+
+#[test]
+fn scalar_and_vector_paths_agree_bit_for_bit() {
+    let image = Scene::random(700, 233.0, 5).draw(233, 197, (1.0, 0.0), (0.0, 0.0));
+    for first_octave in [FirstOctave::Doubled, FirstOctave::Original] {
+        let plain = extract_with(Isa::BASELINE, &image, None, &options(first_octave));
+        let best = extract_with(Isa::detect(), &image, None, &options(first_octave));
+        assert!(plain.len() > 100);
+        assert_eq!(plain, best);
+    }
+}
+
+#[test]
+fn features_do_not_depend_on_the_number_of_threads() {
+    let image = Scene::random(500, 200.0, 9).draw(200, 200, (1.0, 0.0), (0.0, 0.0));
+    let run = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| extract(&image, None, &SiftOptions::default()))
+    };
+    assert_eq!(run(1), run(3));
+}
+
+/// Of features of `first` that `second` shows: how many are found again, how many of the ratio-test matches there
+/// are, and how many of these are right.
+fn compare(first: &Features, second: &Features, to_second: impl Fn(f64, f64) -> (f64, f64), side: f64) -> [usize; 4] {
+    let (mut shown, mut repeated, mut matched, mut right) = (0, 0, 0, 0);
+    for (k, keypoint) in first.keypoints.iter().enumerate() {
+        let (x, y) = to_second(f64::from(keypoint.x_px), f64::from(keypoint.y_px));
+        if !(20.0..side - 20.0).contains(&x) || !(20.0..side - 20.0).contains(&y) {
+            continue;
+        }
+        let distance = |other: &Keypoint| (f64::from(other.x_px) - x).hypot(f64::from(other.y_px) - y);
+        shown += 1;
+        repeated += usize::from(second.keypoints.iter().any(|other| distance(other) < 1.5));
+        let mut nearest = [(u32::MAX, 0), (u32::MAX, 0)];
+        for other in 0..second.len() {
+            let pairs = first.descriptor(k).iter().zip(second.descriptor(other));
+            let squared = pairs.map(|(a, b)| u32::from(a.abs_diff(*b)).pow(2)).sum();
+            if squared < nearest[0].0 {
+                nearest = [(squared, other), nearest[0]];
+            } else if squared < nearest[1].0 {
+                nearest[1] = (squared, other);
+            }
+        }
+        if f64::from(nearest[0].0) < 0.64 * f64::from(nearest[1].0) {
+            matched += 1;
+            right += usize::from(distance(&second.keypoints[nearest[0].1]) < 1.5);
+        }
+    }
+    [shown, repeated, matched, right]
+}
+
+#[test]
+fn features_survive_rotation_and_scale() {
+    let scene = Scene::random(900, 260.0, 77);
+    let side = 260.0;
+    let first = extract(&scene.draw(260, 260, (1.0, 0.0), (0.0, 0.0)), None, &options(FirstOctave::Original));
+    for (angle, scale) in [(0.0_f64, 1.0_f64), (0.5, 1.0), (2.3, 1.0), (-1.1, 1.3), (0.3, 0.8)] {
+        let rotation = (scale * angle.cos(), scale * angle.sin());
+        let center = transformed((130.0, 130.0), rotation, (0.0, 0.0));
+        let shift = (130.37 - center.0, 129.81 - center.1);
+        let second = extract(&scene.draw(260, 260, rotation, shift), None, &options(FirstOctave::Original));
+        let counts = compare(&first, &second, |x, y| transformed((x, y), rotation, shift), side);
+        let [shown, repeated, matched, right] = counts.map(|c| c as f64);
+        assert!(shown > 100.0, "{counts:?}");
+        assert!(repeated > 0.7 * shown, "{angle} {scale}: {counts:?}");
+        assert!(matched > 0.45 * shown, "{angle} {scale}: {counts:?}");
+        assert!(right > 0.95 * matched, "{angle} {scale}: {counts:?}");
+    }
+}
+
+#[test]
+fn orientation_turns_with_the_image() {
+    let scene = Scene::random(300, 160.0, 3);
+    let first = extract(&scene.draw(160, 160, (1.0, 0.0), (0.0, 0.0)), None, &SiftOptions::default());
+    let angle = 0.7_f64;
+    let (rotation, center) = ((angle.cos(), angle.sin()), transformed((80.0, 80.0), (angle.cos(), angle.sin()), (0.0, 0.0)));
+    let shift = (80.0 - center.0, 80.0 - center.1);
+    let second = extract(&scene.draw(160, 160, rotation, shift), None, &SiftOptions::default());
+    let mut errors = Vec::new();
+    for a in &first.keypoints {
+        let (x, y) = transformed((f64::from(a.x_px), f64::from(a.y_px)), rotation, shift);
+        let near = second.keypoints.iter().filter(|b| (f64::from(b.x_px) - x).hypot(f64::from(b.y_px) - y) < 0.5);
+        let turns = near.map(|b| {
+            let turn = (f64::from(b.orientation_rad - a.orientation_rad) - angle) / std::f64::consts::TAU;
+            (turn - turn.round()).abs() * 360.0
+        });
+        errors.extend(turns.reduce(f64::min));
+    }
+    errors.sort_by(f64::total_cmp);
+    assert!(errors.len() > 50);
+    assert!(errors[errors.len() / 2] < 1.0, "median {} degrees", errors[errors.len() / 2]);
+}
+
+#[test]
+fn images_without_features_are_no_error() {
+    for (width, height) in [(1, 1), (1, 50), (3, 3), (11, 400), (12, 12), (13, 13), (64, 64)] {
+        let flat = GrayImage { width, height, data: vec![77; width * height] };
+        for first_octave in [FirstOctave::Doubled, FirstOctave::Original] {
+            assert!(extract(&flat, None, &options(first_octave)).is_empty(), "{width} x {height}");
+        }
+    }
+    let nothing = GrayImage { width: 0, height: 0, data: Vec::new() };
+    assert!(extract(&nothing, None, &SiftOptions::default()).is_empty());
+}
+
+#[test]
+fn the_limit_holds_and_a_prefix_is_the_strongest() {
+    let image = Scene::random(1500, 300.0, 21).draw(300, 300, (1.0, 0.0), (0.0, 0.0));
+    let all = extract(&image, None, &SiftOptions::default());
+    let few = extract(&image, None, &SiftOptions { max_features: 200, ..SiftOptions::default() });
+    assert!(all.len() > 400);
+    assert_eq!(few.len(), 200);
+    let again = extract(&image, None, &SiftOptions { max_features: 200, ..SiftOptions::default() });
+    assert_eq!(few, again);
+    // The strongest of all is the first of the few.
+    assert_eq!(few.keypoints[0], all.keypoints[0]);
+}
+
+#[test]
+fn selection_spreads_and_keeps_the_strongest() {
+    // 900 strong places in one corner, 100 weak ones elsewhere.
+    let place = |k: usize| match k {
+        0..900 => Ranked { x_px: (k % 30) as f32, y_px: (k / 30) as f32 },
+        _ => Ranked { x_px: 40.0 + 59.0 * ((k % 10) as f32 / 10.0), y_px: 40.0 + (k as f32 - 900.0) * 0.6 },
+    };
+    let places: Vec<Ranked> = (0..1000).map(place).collect();
+    let strongest = select(&places, 300, 0.0, (100, 100));
+    assert_eq!(strongest, (0..300).collect::<Vec<_>>());
+    let spread = select(&places, 300, 1.0, (100, 100));
+    assert_eq!(spread.len(), 300);
+    assert!(spread.iter().filter(|&&k| k >= 900).count() > 50);
+    assert!(spread.is_sorted());
+}
+
+#[test]
+fn colors_come_from_the_keypoint_s_pixel() {
+    let scene = Scene { background: 30.0, blobs: vec![[40.2, 30.7, 2.5, 200.0]] };
+    let luma = scene.draw(80, 64, (1.0, 0.0), (0.0, 0.0));
+    let mut rgb = RgbImage { width: 80, height: 64, data: vec![0; 3 * 80 * 64] };
+    rgb.data[3 * (30 * 80 + 40)..][..3].copy_from_slice(&[9, 8, 7]);
+    let features = extract(&luma, Some(&rgb), &SiftOptions::default());
+    assert_eq!(features.colors[0], [9, 8, 7]);
+    assert_eq!(extract(&luma, None, &SiftOptions::default()).colors[0], [luma.data[30 * 80 + 40]; 3]);
+}
+
+#[test]
+fn descriptors_have_the_length_of_unit_vectors() {
+    let image = Scene::random(400, 150.0, 2).draw(150, 150, (1.0, 0.0), (0.0, 0.0));
+    let features = extract(&image, None, &SiftOptions::default());
+    for k in 0..features.len() {
+        let length = features.descriptor(k).iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+        assert!((490.0..=520.0).contains(&length), "{length}");
+    }
+}
+
+#[test]
+fn options_name_every_field_that_is_wrong() {
+    assert!(SiftOptions::default().validate().is_ok());
+    let wrong = SiftOptions { max_features: 0, spread: 2.0, edge_threshold: f64::NAN, ..SiftOptions::default() };
+    let error = wrong.validate().unwrap_err();
+    assert!(error.is_invalid_option());
+    for name in ["max_features", "spread", "edge_threshold"] {
+        assert!(error.to_string().contains(name), "{error}");
+    }
+}
