@@ -21,8 +21,17 @@ pub(super) fn probe(bytes: &[u8]) -> Result<(u32, u32), FrontendError> {
     }
     let size = (word(16)?, word(20)?);
     let mut at = 8_usize;
-    while bytes.get(at + 4..at + 8).ok_or_else(|| broken("truncated"))? != b"IEND" {
+    loop {
+        let name =
+            bytes.get(at.saturating_add(4)..at.saturating_add(8)).ok_or_else(|| broken("truncated"))?;
+        let is_last = name == b"IEND";
         at = at.saturating_add(12).saturating_add(word(at)? as usize);
+        if is_last {
+            break;
+        }
+    }
+    if at > bytes.len() {
+        return Err(broken("truncated"));
     }
     Ok(size)
 }
