@@ -48,11 +48,13 @@ pub(crate) struct Cluster<'a> {
     starts: Vec<u32>,
     /// Matched features, ascending within each feature's range.
     neighbours: Vec<u32>,
+    /// Features whose only match no third image shares, in pairs that do without.
+    lone: Vec<bool>,
 }
 
 impl<'a> Cluster<'a> {
-    /// Checks an input and indexes it.
-    pub fn new(input: &'a ClusterInput) -> Result<Self, MappingError> {
+    /// Checks an input and indexes it. For `two_view_limit` see [`Cluster::is_lone`].
+    pub fn new(input: &'a ClusterInput, two_view_limit: usize) -> Result<Self, MappingError> {
         let mut images: Vec<&ClusterImage> = input.images.iter().collect();
         images.sort_by_key(|image| image.image);
         if let Some(twice) = images.windows(2).find(|two| two[0].image == two[1].image) {
@@ -82,7 +84,7 @@ impl<'a> Cluster<'a> {
             pairs_of[pair.second].push(at);
         }
         let (starts, neighbours) = adjacency(&pairs, &offsets);
-        Ok(Self {
+        let mut cluster = Self {
             id: input.cluster,
             images,
             cameras,
@@ -93,7 +95,30 @@ impl<'a> Cluster<'a> {
             image_of,
             starts,
             neighbours,
-        })
+            lone: vec![false; total],
+        };
+        cluster.find_lone(two_view_limit);
+        Ok(cluster)
+    }
+
+    /// Marks the features of matches that no third image shares, in pairs with enough others.
+    fn find_lone(&mut self, two_view_limit: usize) {
+        let mut lone = std::mem::take(&mut self.lone);
+        for pair in &self.pairs {
+            let is_lone =
+                |&(a, b): &(u32, u32)| self.neighbours(a).len() == 1 && self.neighbours(b).len() == 1;
+            let (alone, shared): (Vec<_>, Vec<_>) = self.matches(pair).partition(is_lone);
+            if shared.len() >= two_view_limit {
+                alone.into_iter().flat_map(|(a, b)| [a, b]).for_each(|feature| lone[feature as usize] = true);
+            }
+        }
+        self.lone = lone;
+    }
+
+    /// Whether a feature's only match is one that no third image shares, in a pair with at least `two_view_limit` others.
+    /// Nothing confirms such matches, so they are left out where they are not needed.
+    pub fn is_lone(&self, feature: u32) -> bool {
+        self.lone[feature as usize]
     }
 
     /// How many images there are.

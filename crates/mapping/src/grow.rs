@@ -76,6 +76,8 @@ struct Grower<'a, 'g> {
     /// What each image saw when it failed last.
     visible_at_failure: Vec<u32>,
     refusals: Vec<Option<Refusal>>,
+    /// Images that are not tried again.
+    barred: Vec<bool>,
     /// Retriangulations of each pair.
     retriangulations: Vec<u8>,
     /// Images and points at the last full adjustment.
@@ -92,7 +94,9 @@ impl<'a, 'g> Grower<'a, 'g> {
         model.set_pose(images.first, Rigid3::identity());
         model.set_pose(images.second, start.second_from_first);
         for (x_in_world, features) in &start.points {
-            model.add_point(*x_in_world, features);
+            if !cluster.is_lone(features[0]) {
+                model.add_point(*x_in_world, features);
+            }
         }
         let report =
             SubmapReport { initial_pair: Some(images.source.summary.pair), ..SubmapReport::default() };
@@ -105,6 +109,7 @@ impl<'a, 'g> Grower<'a, 'g> {
             attempts: vec![0; cluster.num_images()],
             visible_at_failure: vec![0; cluster.num_images()],
             refusals: vec![None; cluster.num_images()],
+            barred: vec![false; cluster.num_images()],
             retriangulations: vec![0; cluster.pairs.len()],
             at_last_full: (2, 0),
             step: 0,
@@ -123,7 +128,7 @@ impl<'a, 'g> Grower<'a, 'g> {
 
     /// Two views say little about intrinsics: only poses and points move.
     fn settle_start(&mut self) -> Result<(), MappingError> {
-        self.adjust_whole(self.ground.options.adjustment.full_iterations, RefineIntrinsics::NONE)?;
+        self.adjust_whole(RefineIntrinsics::NONE, &self.growing_solver())?;
         let ids = self.model.point_ids();
         self.filter(&ids);
         self.mark_full();
@@ -134,7 +139,7 @@ impl<'a, 'g> Grower<'a, 'g> {
     fn register_next(&mut self, taken: &[bool]) -> Result<bool, MappingError> {
         let options = self.ground.options;
         for image in registration::next_images(&self.model, options.registration.min_inliers as u32) {
-            if taken[image] || !self.is_worth_trying(image) {
+            if taken[image] || self.barred[image] || !self.is_worth_trying(image) {
                 continue;
             }
             let seed = self.next_seed("register");
@@ -171,13 +176,13 @@ impl<'a, 'g> Grower<'a, 'g> {
         let grown = images as f64 >= options.full_growth_images * self.at_last_full.0 as f64
             || points as f64 >= options.full_growth_points * self.at_last_full.1 as f64;
         if images <= options.small_model_images || grown {
-            return self.adjust_fully(1);
+            return self.adjust_fully();
         }
         let scope = Scope::around(&self.model, image, options.local_images);
         let solver = BundleOptions {
             max_iterations: options.local_iterations,
             cost_tolerance: 1e-4,
-            ..robust_options()
+            ..self.solver(Loss::SoftL1)
         };
         let solved = bundle::adjust(&mut self.model, &scope, &solver)?;
         self.report.local_adjustments += 1;
@@ -191,16 +196,12 @@ impl<'a, 'g> Grower<'a, 'g> {
     }
 
     /// A full adjustment while the model grows.
-    fn adjust_fully(&mut self, rounds: u32) -> Result<(), MappingError> {
-        let adjustment = &self.ground.options.adjustment;
+    fn adjust_fully(&mut self) -> Result<(), MappingError> {
         self.extend_touched();
         self.retriangulate();
-        for _ in 0..rounds {
-            let refine = self.refinement();
-            self.adjust_whole(adjustment.full_iterations, refine)?;
-            let ids = self.model.point_ids();
-            self.filter(&ids);
-        }
+        self.adjust_whole(self.refinement(), &self.growing_solver())?;
+        let ids = self.model.point_ids();
+        self.filter(&ids);
         self.remove_weak_images();
         self.mark_full();
         Ok(())
@@ -218,7 +219,13 @@ impl<'a, 'g> Grower<'a, 'g> {
             let ids = self.model.point_ids();
             changed += points::merge(&mut self.model, &ids, self.limits);
             let refine = self.refinement();
-            self.adjust_whole(adjustment.final_iterations, refine)?;
+            // What is still wrong by now is wrong for good: a loss that forgets it, where growth needs one that is convex.
+            let solver = BundleOptions {
+                max_iterations: adjustment.final_iterations,
+                cost_tolerance: 1e-6,
+                ..self.solver(Loss::Cauchy)
+            };
+            self.adjust_whole(refine, &solver)?;
             let ids = self.model.point_ids();
             changed += self.filter(&ids);
             self.remove_weak_images();
@@ -228,6 +235,21 @@ impl<'a, 'g> Grower<'a, 'g> {
         }
         self.mark_full();
         Ok(())
+    }
+
+    /// Wrong matches that are not yet filtered out must not bend the model.
+    fn solver(&self, loss: Loss) -> BundleOptions {
+        let loss_scale_px = self.ground.options.adjustment.loss_scale_px;
+        BundleOptions { loss, loss_scale_px, ..BundleOptions::default() }
+    }
+
+    /// The solver of full adjustments while the model grows.
+    fn growing_solver(&self) -> BundleOptions {
+        BundleOptions {
+            max_iterations: self.ground.options.adjustment.full_iterations,
+            cost_tolerance: 1e-5,
+            ..self.solver(Loss::SoftL1)
+        }
     }
 
     /// Which intrinsics may move now.
@@ -244,13 +266,12 @@ impl<'a, 'g> Grower<'a, 'g> {
         }
     }
 
-    /// Adjusts everything; cameras that leave the sane range are put back, held, and everything is adjusted again.
-    fn adjust_whole(&mut self, iterations: u32, refine: RefineIntrinsics) -> Result<(), MappingError> {
+    /// Adjusts everything. Where a camera leaves the sane range, all goes back and is adjusted again without its freedom.
+    fn adjust_whole(&mut self, refine: RefineIntrinsics, solver: &BundleOptions) -> Result<(), MappingError> {
         let before = self.model.clone_geometry();
-        let solver = BundleOptions { max_iterations: iterations, cost_tolerance: 1e-5, ..robust_options() };
         for _ in 0..=self.model.cameras.len() {
             let scope = Scope::whole(&self.model, refine);
-            let solved = bundle::adjust(&mut self.model, &scope, &solver)?;
+            let solved = bundle::adjust(&mut self.model, &scope, solver)?;
             self.report.full_adjustments += 1;
             self.report.adjustment_iterations += solved.iterations;
             let insane: Vec<usize> = (0..self.model.cameras.len())
@@ -261,14 +282,30 @@ impl<'a, 'g> Grower<'a, 'g> {
                 break;
             }
             self.model.restore_geometry(&before);
-            for at in insane {
-                self.model.cameras[at] = self.ground.cameras[at];
-                self.model.frozen[at] = true;
-                self.report.reset_cameras += 1;
-            }
+            insane.into_iter().for_each(|camera| self.tame(camera));
         }
         self.model.normalise();
         Ok(())
+    }
+
+    /// Holds a camera at its first intrinsics. When few of the images are its, it may be no camera at all (a map, a drawing,
+    /// a crop), and these images leave the model for good.
+    fn tame(&mut self, camera: usize) {
+        self.model.cameras[camera] = self.ground.cameras[camera];
+        self.model.frozen[camera] = true;
+        self.report.reset_cameras += 1;
+        let registered = self.model.registered();
+        let (own, others): (Vec<usize>, Vec<usize>) =
+            registered.into_iter().partition(|&image| self.model.cluster.camera_of[image] == camera);
+        if own.len() >= others.len() {
+            return;
+        }
+        for image in own {
+            self.model.deregister(image);
+            self.barred[image] = true;
+            self.refusals[image] = Some(Refusal::InsaneCamera);
+            self.report.removed_images += 1;
+        }
     }
 
     /// Completes and merges the tracks that changed; those that did so, or came of it.
@@ -311,12 +348,6 @@ impl<'a, 'g> Grower<'a, 'g> {
     }
 
     fn finish(mut self) -> Grown<'a> {
-        if !self.ground.options.triangulation.keep_two_view_points {
-            let weak: Vec<PointId> =
-                self.model.points().filter(|(_, point)| point.track.len() < 3).map(|(id, _)| id).collect();
-            weak.into_iter().for_each(|id| self.model.remove_point(id));
-            self.remove_weak_images();
-        }
         self.model.normalise();
         let result = assemble::reconstruction(&self.model);
         self.report.num_images = self.model.num_registered() as u32;
@@ -326,9 +357,4 @@ impl<'a, 'g> Grower<'a, 'g> {
         self.report.mean_track_length = result.mean_track_length();
         Grown { model: self.model, report: self.report, refusals: self.refusals }
     }
-}
-
-/// Wrong matches that are not yet filtered out must not bend the model.
-fn robust_options() -> BundleOptions {
-    BundleOptions { loss: Loss::SoftL1, loss_scale_px: 1.0, ..BundleOptions::default() }
 }

@@ -33,7 +33,7 @@ pub fn reconstruct(
     if !problems.is_empty() {
         return Err(Kind::Options(problems.join("; ")).into());
     }
-    let cluster = Cluster::new(input)?;
+    let cluster = Cluster::new(input, options.triangulation.two_view_limit)?;
     let (cameras, guessed) = focal::initial_cameras(&cluster, seed);
     let ground = Ground { cluster: &cluster, options, cameras: &cameras, guessed: &guessed };
     let mut mapping = Mapping {

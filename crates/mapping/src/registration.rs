@@ -17,6 +17,8 @@ pub(crate) enum Refusal {
     TooFewInliers { inliers: usize, of: usize },
     /// It was in the model, and filtering took nearly all of its observations.
     LostSupport { min_observed: u32 },
+    /// Adjustment gave its camera intrinsics that no camera has.
+    InsaneCamera,
 }
 
 impl Refusal {
@@ -29,6 +31,10 @@ impl Refusal {
             }
             Self::TooFewInliers { inliers, of } => {
                 format!("only {inliers} of its {of} matches to points agree on a pose")
+            }
+            Self::InsaneCamera => {
+                "its camera fits the other images only with a focal length or distortion that no camera has"
+                    .to_owned()
             }
             Self::LostSupport { min_observed } => {
                 format!("fewer than {min_observed} of its observations held against the other images")

@@ -21,14 +21,17 @@ enum Proposal {
 
 /// Gives the features of an image points: those of their matches, or new ones. Returns how many features got one.
 pub(crate) fn triangulate_image(model: &mut Model<'_>, image: usize, limits: Limits, seed: Seed) -> usize {
-    let features: Vec<u32> = model
-        .cluster
-        .features_of(image)
-        .filter(|&feature| model.point_of(feature).is_none() && !model.cluster.neighbours(feature).is_empty())
-        .collect();
+    let features: Vec<u32> =
+        model.cluster.features_of(image).filter(|&feature| is_open(model, feature)).collect();
     let proposals: Vec<Option<Proposal>> =
         features.par_iter().with_min_len(32).map(|&feature| propose(model, feature, limits, seed)).collect();
     proposals.into_iter().flatten().map(|proposal| apply(model, proposal)).sum()
+}
+
+/// Whether a feature could get a point.
+fn is_open(model: &Model<'_>, feature: u32) -> bool {
+    let cluster = model.cluster;
+    model.point_of(feature).is_none() && !cluster.neighbours(feature).is_empty() && !cluster.is_lone(feature)
 }
 
 fn apply(model: &mut Model<'_>, proposal: Proposal) -> usize {
@@ -126,7 +129,7 @@ pub(crate) fn retriangulate(
             .matches(&cluster.pairs[at])
             .filter(|&(a, b)| model.point_of(a).is_none() || model.point_of(b).is_none())
             .flat_map(|(a, b)| [a, b])
-            .filter(|&feature| model.point_of(feature).is_none())
+            .filter(|&feature| is_open(model, feature))
             .collect();
         let proposals: Vec<Option<Proposal>> = features
             .par_iter()

@@ -47,7 +47,7 @@ proptest! {
     fn counts_follow_every_change(steps in prop::collection::vec((0u8..5, any::<u32>(), any::<u32>()), 1..60)) {
         let options = SceneOptions { num_images: 4, num_points: 60, min_matches: 5, ..SceneOptions::default() };
         let input = cluster_of(&SyntheticScene::new(&options));
-        let cluster = Cluster::new(&input).expect("the input is sound");
+        let cluster = Cluster::new(&input, 0).expect("the input is sound");
         let cameras = cluster.cameras.iter().map(|(_, record)| record.camera).collect();
         let mut model = Model::new(&cluster, cameras, vec![false]);
         let count = cluster.num_features() as u32;
@@ -73,7 +73,7 @@ proptest! {
 #[test]
 fn spread_points_score_higher_than_a_clump() {
     let input = cluster_of(&SyntheticScene::new(&SceneOptions { num_images: 2, ..SceneOptions::default() }));
-    let cluster = Cluster::new(&input).expect("the input is sound");
+    let cluster = Cluster::new(&input, 0).expect("the input is sound");
     let mut by_column: Vec<(u32, u32)> = cluster.matches(&cluster.pairs[0]).collect();
     by_column.sort_by(|a, b| cluster.xy_px(a.1).x.total_cmp(&cluster.xy_px(b.1).x));
     let score = |features: &mut dyn Iterator<Item = u32>| {

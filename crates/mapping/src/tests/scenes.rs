@@ -48,7 +48,8 @@ fn street() {
     let layout = Layout::Street { spacing_m: 2.0, half_width_m: 8.0 };
     // Wide enough for cameras that look at one facade to see the other one far ahead.
     let camera = Camera::centered(CameraModel::SimpleRadial, 1200, 900, 600.0);
-    let options = SceneOptions { layout, camera, num_images: 30, num_points: 6000, ..SceneOptions::default() };
+    let options =
+        SceneOptions { layout, camera, num_images: 30, num_points: 6000, ..SceneOptions::default() };
     let (_, comparison, _) = map_whole(&options);
     assert!(comparison.center_rmse_m < 0.3, "{comparison:?}");
     assert!(comparison.center_rmse_m > 0.0005, "{comparison:?}");
