@@ -1,6 +1,7 @@
 //! Which unknowns the reduced camera system has, and the cameras at one point of the search.
 
 use nalgebra::{Matrix3, Vector3, Vector6};
+use terrane_geometry::camera::MAX_PARAMS;
 use terrane_geometry::{Camera, Rigid3};
 
 use super::BundleProblem;
@@ -56,7 +57,7 @@ impl Layout {
             }
         }
         let most = params.iter().map(Vec::len).max().unwrap_or(0);
-        let stride = STRIDES.into_iter().find(|stride| *stride >= most).unwrap_or(most);
+        let stride = STRIDES.into_iter().find(|stride| *stride >= most).unwrap_or(MAX_PARAMS);
         let intrinsics_variable_of_pose =
             problem.intrinsics_of_pose.iter().map(|i| intrinsics_variable[*i as usize]).collect();
         Self {
@@ -82,7 +83,7 @@ impl Layout {
 }
 
 /// The strides for which kernels are compiled with fixed sizes.
-pub(super) const STRIDES: [usize; 6] = [0, 1, 2, 3, 4, 6];
+pub(super) const STRIDES: [usize; 9] = [0, 1, 2, 3, 4, 6, 8, 12, MAX_PARAMS];
 
 /// Poses and intrinsics at one point of the search, ready for projecting.
 #[derive(Clone)]

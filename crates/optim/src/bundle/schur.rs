@@ -5,8 +5,10 @@
 
 use rayon::prelude::*;
 
+use terrane_geometry::camera::MAX_PARAMS;
+
 use super::layout::{Layout, NONE};
-use super::linearisation::{Linearisation, PoseZ, Terms};
+use super::linearisation::{Linearisation, PoseZ};
 use super::plan::ShardPlan;
 
 /// A block of pose by pose, column-major.
@@ -97,18 +99,20 @@ pub(super) fn accumulate(rows: &mut [PoseRow], layout: &Layout, plan: &ShardPlan
         for (slot, column) in row.intrinsics_columns.iter().enumerate() {
             slots.intrinsics[*column as usize] = slot as u32;
         }
-        let work = RowWork { layout, plan, shard, slots, pose };
-        // Fixed sizes let the compiler unroll; any other stride takes the general path with the same sums.
-        match layout.stride {
-            0 => work.accumulate::<0>(row),
-            1 => work.accumulate::<1>(row),
-            2 => work.accumulate::<2>(row),
-            3 => work.accumulate::<3>(row),
-            4 => work.accumulate::<4>(row),
-            6 => work.accumulate::<6>(row),
-            _ => work.accumulate::<{ usize::MAX }>(row),
-        }
+        RowWork { layout, plan, shard, slots, pose }.run(row, wide_is_available());
     });
+}
+
+/// Whether rows may run on 256-bit vectors; the sums are the same either way, bit for bit.
+fn wide_is_available() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    {
+        std::arch::is_x86_feature_detected!("avx2")
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    {
+        false
+    }
 }
 
 struct RowWork<'a> {
@@ -120,24 +124,61 @@ struct RowWork<'a> {
 }
 
 impl RowWork<'_> {
+    /// Fixed sizes let the compiler unroll; more parameters than these are padded to the next.
+    fn run(&self, row: &mut PoseRow, wide: bool) {
+        match self.layout.stride {
+            // Without refined intrinsics their arrays are empty.
+            0 | 1 => self.dispatch::<1>(row, wide),
+            2 => self.dispatch::<2>(row, wide),
+            3 => self.dispatch::<3>(row, wide),
+            4 => self.dispatch::<4>(row, wide),
+            6 => self.dispatch::<6>(row, wide),
+            8 => self.dispatch::<8>(row, wide),
+            12 => self.dispatch::<12>(row, wide),
+            _ => self.dispatch::<{ MAX_PARAMS }>(row, wide),
+        }
+    }
+
+    fn dispatch<const K: usize>(&self, row: &mut PoseRow, wide: bool) {
+        #[cfg(target_arch = "x86_64")]
+        if wide {
+            // SAFETY: `wide` comes from `wide_is_available`, so this processor has AVX2.
+            unsafe { self.accumulate_wide::<K>(row) };
+            return;
+        }
+        let _ = wide;
+        self.accumulate::<K>(row);
+    }
+
+    /// [`RowWork::accumulate`] compiled for 256-bit vectors: the same operations in the same order, without fusing, so
+    /// that the bytes equal those of the plain twin.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn accumulate_wide<const K: usize>(&self, row: &mut PoseRow) {
+        self.accumulate::<K>(row);
+    }
+
+    #[inline(always)]
     fn accumulate<const K: usize>(&self, row: &mut PoseRow) {
-        let stride = if K == usize::MAX { self.layout.stride } else { K };
         let free = !row.pose_columns.is_empty();
-        let refined = self.layout.intrinsics_variable_of_pose[self.pose] != NONE;
+        let own = self.layout.intrinsics_variable_of_pose[self.pose];
+        let own = (own != NONE).then(|| self.slots.intrinsics[own as usize] as usize);
+        let (intrinsics, _) = self.shard.intrinsics.as_chunks::<K>();
         for &observation in self.plan.of_pose(self.pose) {
             let observation = observation as usize;
+            let jacobian =
+                own.map(|slot| (slot, &intrinsics[2 * observation], &intrinsics[2 * observation + 1]));
             if free {
                 self.add_pose(row, observation);
-                if stride > 0 {
-                    self.add_pose_by_intrinsics(row, observation, stride);
-                }
+                self.add_pose_by_intrinsics::<K>(row, observation, jacobian);
             }
-            if stride > 0 && refined {
-                self.add_intrinsics(row, observation, stride);
+            if let Some((slot, x, y)) = jacobian {
+                self.add_intrinsics::<K>(row, observation, slot, [x, y]);
             }
         }
     }
 
+    #[inline(always)]
     fn add_pose(&self, row: &mut PoseRow, observation: usize) {
         let terms = &self.shard.terms[observation];
         let own = &mut row.pose_pose[0];
@@ -161,34 +202,36 @@ impl RowWork<'_> {
         for a in 0..6 {
             row.pose.reduced[a] -= z[a] * reduced[0] + z[6 + a] * reduced[1] + z[12 + a] * reduced[2];
         }
-        for other in observation..self.plan.of_point(point).end {
-            let other_pose = self.plan.observations[other].pose;
-            let variable = self.layout.pose_variable[other_pose as usize];
+        let end = self.plan.of_point(point).end;
+        let others =
+            self.plan.observations[observation..end].iter().zip(&self.shard.pose_z[observation..end]);
+        for (i, (other, other_z)) in others.enumerate() {
+            let variable = self.layout.pose_variable[other.pose as usize];
             if variable == NONE {
                 continue;
             }
             let block = &mut row.pose_pose[self.slots.pose[variable as usize] as usize];
-            subtract_outer(block, z, &self.shard.pose_z[other]);
-            if other != observation && other_pose == planned.pose {
+            subtract_outer(block, z, other_z);
+            if i > 0 && other.pose == planned.pose {
                 // A pose that sees a point twice: the pair counts in both orders.
-                subtract_outer(block, &self.shard.pose_z[other], z);
+                subtract_outer(block, other_z, z);
             }
         }
     }
 
     #[inline(always)]
-    fn add_pose_by_intrinsics(&self, row: &mut PoseRow, observation: usize, stride: usize) {
-        let planned = &self.plan.observations[observation];
-        let variable = self.layout.intrinsics_variable_of_pose[self.pose];
-        if variable != NONE {
-            let slot = self.slots.intrinsics[variable as usize] as usize;
-            let block = &mut row.pose_intrinsics[6 * stride * slot..6 * stride * (slot + 1)];
+    fn add_pose_by_intrinsics<const K: usize>(
+        &self,
+        row: &mut PoseRow,
+        observation: usize,
+        jacobian: Option<(usize, &[f64; K], &[f64; K])>,
+    ) {
+        let (blocks, _) = row.pose_intrinsics.as_chunks_mut::<6>();
+        if let Some((slot, x, y)) = jacobian {
             let terms = &self.shard.terms[observation];
-            let (x, y) = self.shard.intrinsics[2 * stride * observation..2 * stride * (observation + 1)]
-                .split_at(stride);
-            for c in 0..stride {
+            for (c, column) in blocks[K * slot..K * (slot + 1)].iter_mut().enumerate() {
                 for a in 0..6 {
-                    block[6 * c + a] += terms.pose[0][a] * x[c] + terms.pose[1][a] * y[c];
+                    column[a] += terms.pose[0][a] * x[c] + terms.pose[1][a] * y[c];
                 }
             }
         }
@@ -196,30 +239,32 @@ impl RowWork<'_> {
             return;
         }
         let z = &self.shard.pose_z[observation];
-        for entry in self.plan.entries_of_point(planned.point as usize) {
+        let (entry_z, _) = self.shard.entry_z.as_chunks::<K>();
+        for entry in self.plan.entries_of_point(self.plan.observations[observation].point as usize) {
             let variable = self.layout.intrinsics_variable[self.plan.entry_intrinsics[entry] as usize];
             let slot = self.slots.intrinsics[variable as usize] as usize;
-            let block = &mut row.pose_intrinsics[6 * stride * slot..6 * stride * (slot + 1)];
-            let other = &self.shard.entry_z[3 * stride * entry..3 * stride * (entry + 1)];
-            for c in 0..stride {
-                let (z0, z1, z2) = (other[c], other[stride + c], other[2 * stride + c]);
+            let [z0, z1, z2] = [&entry_z[3 * entry], &entry_z[3 * entry + 1], &entry_z[3 * entry + 2]];
+            for (c, column) in blocks[K * slot..K * (slot + 1)].iter_mut().enumerate() {
                 for a in 0..6 {
-                    block[6 * c + a] -= z[a] * z0 + z[6 + a] * z1 + z[12 + a] * z2;
+                    column[a] -= z[a] * z0[c] + z[6 + a] * z1[c] + z[12 + a] * z2[c];
                 }
             }
         }
     }
 
     #[inline(always)]
-    fn add_intrinsics(&self, row: &mut PoseRow, observation: usize, stride: usize) {
-        let Terms { residual, .. } = &self.shard.terms[observation];
-        let (x, y) =
-            self.shard.intrinsics[2 * stride * observation..2 * stride * (observation + 1)].split_at(stride);
-        let block = stride * stride;
-        let own = &mut row.intrinsics_intrinsics[..block];
-        for c in 0..stride {
-            for a in 0..stride {
-                own[stride * c + a] += x[a] * x[c] + y[a] * y[c];
+    fn add_intrinsics<const K: usize>(
+        &self,
+        row: &mut PoseRow,
+        observation: usize,
+        own_slot: usize,
+        [x, y]: [&[f64; K]; 2],
+    ) {
+        let residual = &self.shard.terms[observation].residual;
+        let (blocks, _) = row.intrinsics_intrinsics.as_chunks_mut::<K>();
+        for (c, column) in blocks[..K].iter_mut().enumerate() {
+            for a in 0..K {
+                column[a] += x[a] * x[c] + y[a] * y[c];
             }
             let gradient = &mut row.intrinsics[c];
             let value = x[c] * residual[0] + y[c] * residual[1];
@@ -231,22 +276,22 @@ impl RowWork<'_> {
             return;
         }
         let planned = &self.plan.observations[observation];
-        let z = &self.shard.intrinsics_z[3 * stride * observation..3 * stride * (observation + 1)];
+        let (z, _) = self.shard.intrinsics_z.as_chunks::<K>();
+        let z = [&z[3 * observation], &z[3 * observation + 1], &z[3 * observation + 2]];
         let reduced = &self.shard.points[planned.point as usize].reduced;
-        for a in 0..stride {
+        for a in 0..K {
             row.intrinsics[a].reduced[0] -=
-                z[a] * reduced[0] + z[stride + a] * reduced[1] + z[2 * stride + a] * reduced[2];
+                z[0][a] * reduced[0] + z[1][a] * reduced[1] + z[2][a] * reduced[2];
         }
+        let (entry_z, _) = self.shard.entry_z.as_chunks::<K>();
         // Entries of a point ascend, and so the own one is followed by those of the upper triangle.
         for entry in planned.entry as usize..self.plan.entries_of_point(planned.point as usize).end {
             let variable = self.layout.intrinsics_variable[self.plan.entry_intrinsics[entry] as usize];
-            let slot = self.slots.intrinsics[variable as usize] as usize - row.intrinsics_before;
-            let target = &mut row.intrinsics_intrinsics[block * slot..block * (slot + 1)];
-            let other = &self.shard.entry_z[3 * stride * entry..3 * stride * (entry + 1)];
-            for c in 0..stride {
-                let (z0, z1, z2) = (other[c], other[stride + c], other[2 * stride + c]);
-                for a in 0..stride {
-                    target[stride * c + a] -= z[a] * z0 + z[stride + a] * z1 + z[2 * stride + a] * z2;
+            let slot = self.slots.intrinsics[variable as usize] as usize - own_slot;
+            let [z0, z1, z2] = [&entry_z[3 * entry], &entry_z[3 * entry + 1], &entry_z[3 * entry + 2]];
+            for (c, column) in blocks[K * slot..K * (slot + 1)].iter_mut().enumerate() {
+                for a in 0..K {
+                    column[a] -= z[0][a] * z0[c] + z[1][a] * z1[c] + z[2][a] * z2[c];
                 }
             }
         }
@@ -260,6 +305,54 @@ fn subtract_outer(block: &mut PoseBlock, z: &PoseZ, other: &PoseZ) {
         let (z0, z1, z2) = (other[c], other[6 + c], other[12 + c]);
         for a in 0..6 {
             block[6 * c + a] -= z[a] * z0 + z[6 + a] * z1 + z[12 + a] * z2;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Numbers without pattern.
+    fn fill(values: &mut [f64], seed: f64) {
+        for (i, value) in values.iter_mut().enumerate() {
+            *value = ((i as f64 + seed) * 12.9898).sin() * 43.758;
+        }
+    }
+
+    #[test]
+    fn wide_rows_equal_plain_ones_to_the_last_bit() {
+        use super::super::tests::linearised_scene;
+        if !wide_is_available() {
+            println!("this processor has no wide vectors: nothing to compare");
+            return;
+        }
+        for num_params in [0, 1, 2, 4, 8] {
+            let scene = linearised_scene(num_params);
+            let slots = Slots {
+                pose: (0..scene.layout.poses.len() as u32).collect(),
+                intrinsics: (0..scene.layout.intrinsics.len() as u32).collect(),
+            };
+            let make = || {
+                let columns = (0..scene.layout.poses.len() as u32).collect();
+                let mut row = PoseRow::new(
+                    &scene.layout,
+                    0,
+                    columns,
+                    (0..scene.layout.intrinsics.len() as u32).collect(),
+                );
+                row.pose_pose.iter_mut().for_each(|block| fill(block, 1.0));
+                row
+            };
+            let (mut plain, mut wide) = (make(), make());
+            let (layout, plan, shard) = (&scene.layout, &scene.plan, &scene.shard);
+            let work = RowWork { layout, plan, shard, slots: &slots, pose: 0 };
+            work.run(&mut plain, false);
+            work.run(&mut wide, true);
+            assert_eq!(plain.pose_pose, wide.pose_pose);
+            assert_eq!(plain.pose_intrinsics, wide.pose_intrinsics);
+            assert_eq!(plain.intrinsics_intrinsics, wide.intrinsics_intrinsics);
+            assert_eq!(plain.pose.reduced, wide.pose.reduced);
         }
     }
 }

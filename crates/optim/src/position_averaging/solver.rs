@@ -286,17 +286,13 @@ impl<'a> Solver<'a> {
     /// Pulls every unknown a little to where it is, so that what nothing determines stays.
     fn pull(&mut self, state: &State, first: bool) {
         let to_current = !matches!(self.gauge, Gauge::MeanBaseline { .. });
-        let blocks: Vec<(usize, [f64; 3], usize)> = self
-            .node_block
-            .iter()
-            .zip(&state.x)
+        // In the first round a scale is itself, later its relative change.
+        let scale = if first { 1.0 } else { 0.0 };
+        let nodes = self.node_block.iter().zip(&state.x);
+        let groups = self.group_block.iter().flatten();
+        let blocks: Vec<(usize, [f64; 3], usize)> = nodes
             .filter_map(|(block, x)| block.map(|block| (block, [x.x, x.y, x.z], 3)))
-            .chain(
-                self.group_block
-                    .iter()
-                    .zip(&state.scales)
-                    .filter_map(|(b, s)| b.map(|b| (b, [*s, 0.0, 0.0], 1))),
-            )
+            .chain(groups.map(|block| (*block, [scale, 0.0, 0.0], 1)))
             .collect();
         for (block, values, dim) in blocks {
             let offset = self.system.pattern().offset(block);

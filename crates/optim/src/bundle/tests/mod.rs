@@ -177,3 +177,39 @@ fn center_rmse(found: &[Rigid3], truth: &[Rigid3]) -> f64 {
         from.iter().zip(&to).map(|(a, b)| (to_from_found.transform_point(a) - b).norm_squared()).sum();
     (squared / from.len() as f64).sqrt()
 }
+
+/// A linearised and eliminated scene whose intrinsics have so many refined parameters.
+pub(super) struct LinearisedScene {
+    pub layout: super::layout::Layout,
+    pub plan: super::plan::ShardPlan,
+    pub shard: super::linearisation::Linearisation,
+}
+
+pub(super) fn linearised_scene(num_params: usize) -> LinearisedScene {
+    let (model, refine) = match num_params {
+        0 => (CameraModel::SimplePinhole, RefineIntrinsics::NONE),
+        1 => (CameraModel::SimplePinhole, RefineIntrinsics::FOCAL_AND_DISTORTION),
+        2 => (CameraModel::SimpleRadial, RefineIntrinsics::FOCAL_AND_DISTORTION),
+        4 => (CameraModel::SimpleRadial, RefineIntrinsics::ALL),
+        _ => (CameraModel::OpenCv, RefineIntrinsics::ALL),
+    };
+    let scene = Scene::new(SceneOptions { model, num_intrinsics: 3, ..Default::default() });
+    let (mut problem, shard) = scene.disturbed(3);
+    problem.refine.fill(refine);
+    let cameras = super::layout::Cameras::new(problem.poses.clone(), problem.intrinsics.clone());
+    let layout = super::layout::Layout::new(&problem, &vec![true; problem.poses.len()], None);
+    let dropped = super::plan::Dropped::find(&shard, &problem, &cameras);
+    let plan = super::plan::ShardPlan::new(&shard, &dropped, &problem);
+    let context = super::linearisation::Context {
+        problem: &problem,
+        layout: &layout,
+        cameras: &cameras,
+        loss: Loss::Huber,
+        loss_scale_px: 1.0,
+        held_direction: None,
+        damping: 1e-3,
+    };
+    let mut linearised = super::linearisation::Linearisation::new(&plan, layout.stride);
+    linearised.update(&context, &plan, Some(&shard.points));
+    LinearisedScene { plan, shard: linearised, layout }
+}
