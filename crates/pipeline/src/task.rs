@@ -30,7 +30,8 @@ pub struct Task {
 
 /// What exactly a task does.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case", tag = "do")]
+// Tagged from outside: a tag within would make serde buffer the fields, and maps with numbers for keys don't survive that.
+#[serde(rename_all = "snake_case")]
 pub enum TaskSpec {
     /// Read every file of the run's folder or list.
     Ingest {
@@ -217,4 +218,28 @@ pub struct TaskReport {
     pub existed: bool,
     /// Figures in the stage's words, as `images`, `features`, `pairs`.
     pub counts: BTreeMap<String, u64>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::KeyBuilder;
+
+    #[test]
+    fn tasks_survive_the_wire() {
+        let key = |number| KeyBuilder::new(Stage::Features).number(number).finish();
+        let features = FeatureSet { images_per_batch: 8, batches: [(0, key(1)), (1, key(2))].into() };
+        let spec = TaskSpec::Pairs { table: key(0), features, lost: vec![(ImageId(3), 8, "cut off".into())] };
+        let task = Task {
+            key: key(3),
+            stage: Stage::Pairs,
+            item: "11 images".into(),
+            inputs: vec![key(0)],
+            predicted_peak_bytes: 1,
+            predicted_seconds: 0.5,
+            spec,
+        };
+        let json = serde_json::to_vec(&task).unwrap();
+        assert_eq!(serde_json::from_slice::<Task>(&json).unwrap(), task);
+    }
 }
