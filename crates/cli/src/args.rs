@@ -30,6 +30,8 @@ pub struct Arguments {
 pub enum Command {
     /// Reconstruct on this machine: a coordinator and worker processes.
     Run(RunFlags),
+    /// Render a small town with known truth, reconstruct it, and print how far off the result is.
+    Demo(DemoFlags),
     /// Serve as a coordinator, to which workers and clients come.
     Coordinator(CoordinatorFlags),
     /// Work for a coordinator.
@@ -95,6 +97,14 @@ pub struct RunFlags {
     /// What decides the result.
     #[command(flatten)]
     pub options: OptionFlags,
+}
+
+/// Flags of `demo`.
+#[derive(Debug, Args)]
+pub struct DemoFlags {
+    /// Folder of the photographs, the truth and the result.
+    #[arg(short, long, value_name = "FOLDER", default_value = "terrane-demo")]
+    pub out: PathBuf,
 }
 
 /// Flags of `coordinator`.

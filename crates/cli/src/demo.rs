@@ -3,7 +3,7 @@
 use std::fs::File;
 use std::io::BufWriter;
 use std::num::NonZeroU32;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -46,7 +46,8 @@ pub async fn demo(flags: DemoFlags, json: bool) -> Result<(), Failure> {
         let out = out.clone();
         move || render(&town, &out)
     });
-    let truth = truth.await.map_err(|error| Failure::system(format!("rendering the town failed: {error}")))??;
+    let truth =
+        truth.await.map_err(|error| Failure::system(format!("rendering the town failed: {error}")))??;
     let run_flags = RunFlags {
         photos,
         out: out.clone(),
@@ -68,8 +69,9 @@ pub async fn demo(flags: DemoFlags, json: bool) -> Result<(), Failure> {
 
 /// Writes the photographs that are not there yet, and the truth as a COLMAP model.
 fn render(options: &TownOptions, out: &Path) -> Result<Reconstruction, Failure> {
-    let unwritable =
-        |path: &Path, error: std::io::Error| Failure::system(format!("{} can't be written: {error}", path.display()));
+    let unwritable = |path: &Path, error: std::io::Error| {
+        Failure::system(format!("{} can't be written: {error}", path.display()))
+    };
     let photos = out.join("photos");
     std::fs::create_dir_all(&photos).map_err(|error| unwritable(&photos, error))?;
     let town = Town::new(options);
@@ -89,7 +91,8 @@ fn render(options: &TownOptions, out: &Path) -> Result<Reconstruction, Failure> 
 }
 
 fn write_truth(town: &Town, truth: &Reconstruction, folder: &Path) -> Result<(), Failure> {
-    let unwritable = |error: String| Failure::system(format!("{} can't be written: {error}", folder.display()));
+    let unwritable =
+        |error: String| Failure::system(format!("{} can't be written: {error}", folder.display()));
     std::fs::create_dir_all(folder).map_err(|error| unwritable(error.to_string()))?;
     let create = |name: &str| {
         File::create(folder.join(name)).map(BufWriter::new).map_err(|error| unwritable(error.to_string()))
@@ -121,11 +124,13 @@ fn verdict(out: &Path, truth: &Reconstruction) -> Result<Verdict, Failure> {
 /// The town's frame from the result's, from the origins of both; `None` when the result is not geo-referenced.
 fn town_from_result(origin: &Value) -> Option<Rigid3> {
     let number = |key: &str| origin[key].as_f64();
-    let position = Geodetic::from_degrees(number("latitude_deg")?, number("longitude_deg")?, number("height_m")?);
+    let position =
+        Geodetic::from_degrees(number("latitude_deg")?, number("longitude_deg")?, number("height_m")?);
     let (result, town) = (EnuFrame::new(position), EnuFrame::new(Town::origin()));
     let map = |x: nalgebra::Vector3<f64>| town.enu_from_ecef(&result.ecef_from_enu(&x));
     let shift = map(nalgebra::Vector3::zeros());
-    let axes = [nalgebra::Vector3::x(), nalgebra::Vector3::y(), nalgebra::Vector3::z()].map(|axis| map(axis) - shift);
+    let axes = [nalgebra::Vector3::x(), nalgebra::Vector3::y(), nalgebra::Vector3::z()]
+        .map(|axis| map(axis) - shift);
     let rotation = nalgebra::UnitQuaternion::from_matrix(&nalgebra::Matrix3::from_columns(&axes));
     Some(Rigid3::new(rotation, shift))
 }
@@ -151,7 +156,8 @@ fn print(verdict: &Verdict, out: &Path, json: bool) {
     }
     println!("\nThe town, {} photographs, {registered} registered\n", verdict.offered);
     println!("{:<44} {:>10} {:>10} {:>12}", "cameras against truth", "median m", "RMSE m", "median deg");
-    let rows = [("as geo-referenced by noisy GPS", &verdict.absolute), ("after a similarity fit", &verdict.fitted)];
+    let rows =
+        [("as geo-referenced by noisy GPS", &verdict.absolute), ("after a similarity fit", &verdict.fitted)];
     for (name, comparison) in rows {
         match comparison {
             Some(c) => println!(
@@ -165,9 +171,5 @@ fn print(verdict: &Verdict, out: &Path, json: bool) {
     }
     table::print(&verdict.report);
     println!("\nresult: {}   truth: {}", out.display(), out.join("truth").display());
-    println!("look closer: terrane inspect {}", shell(out));
-}
-
-fn shell(path: &Path) -> PathBuf {
-    path.to_path_buf()
+    println!("look closer: terrane inspect {}", out.display());
 }

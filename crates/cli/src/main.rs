@@ -3,17 +3,18 @@
 mod args;
 mod compare;
 mod config;
+mod demo;
 mod exit;
 mod export;
 mod inspect;
 mod machine;
 mod models;
-
 mod progress;
 mod remote;
 mod run;
 mod service;
 mod summary;
+mod table;
 
 use clap::Parser;
 
@@ -33,6 +34,7 @@ fn dispatch(arguments: Arguments) -> Result<(), Failure> {
     let json = arguments.json;
     match arguments.command {
         Command::Run(flags) => service::reactor()?.block_on(run::run(flags, json)),
+        Command::Demo(flags) => service::reactor()?.block_on(demo::demo(flags, json)),
         Command::Coordinator(flags) => service::reactor()?.block_on(service::coordinator(flags)),
         Command::Worker(flags) => service::reactor()?.block_on(service::worker(flags)),
         Command::Submit(flags) => service::reactor()?.block_on(remote::submit(flags, json)),

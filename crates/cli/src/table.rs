@@ -19,7 +19,10 @@ fn number(value: &Value) -> String {
 
 fn result(report: &Value) {
     let frame = report["frame"]["kind"].as_str().unwrap_or("arbitrary");
-    println!("\n{:<12} {:>8} {:>9} {:>13} {:>12} {:>12} {:>12}", "component", "images", "points", "reprojection", "track", "GPS median", "GPS RMSE");
+    println!(
+        "\n{:<12} {:>8} {:>9} {:>13} {:>12} {:>12} {:>12}",
+        "component", "images", "points", "reprojection", "track", "GPS median", "GPS RMSE"
+    );
     for (index, component) in rows(&report["components"]).iter().enumerate() {
         println!(
             "{index:<12} {:>8} {:>9} {:>10} px {:>12} {:>10} m {:>10} m",
@@ -43,12 +46,13 @@ fn seams(report: &Value) {
     for seam in seams {
         let end = |key: &str| seam[key]["cluster"].as_u64().or_else(|| seam[key][0].as_u64()).unwrap_or(0);
         let figures = &seam["figures"];
-        let verdict = seam["refused"].as_str().map_or_else(|| "used".into(), |reason| format!("refused: {reason}"));
+        let verdict =
+            seam["refused"].as_str().map_or_else(|| "used".into(), |reason| format!("refused: {reason}"));
         println!(
             "{:<16} {:>14} m {:>14} m   {verdict}",
             format!("{} - {}", end("a"), end("b")),
-            number(&figures["camera_median"]),
-            number(&figures["point_rms"]),
+            number(&figures["camera_distance_rms"]),
+            number(&figures["point_distance_median"]),
         );
     }
 }
@@ -69,7 +73,10 @@ fn costs(costs: &Value) {
     println!("{:<12} {:>9}", "whole run", seconds(&costs["wall_seconds"]));
     if let Some(peaks) = costs["peak_bytes"].as_object() {
         for (process, bytes) in peaks {
-            println!("peak memory of {process}: {:.0} MiB", bytes.as_f64().unwrap_or(0.0) / f64::from(1 << 20));
+            println!(
+                "peak memory of {process}: {:.0} MiB",
+                bytes.as_f64().unwrap_or(0.0) / f64::from(1 << 20)
+            );
         }
     }
 }
