@@ -15,3 +15,6 @@ pub use reconstruction::{
     decode_reconstruction, encode_reconstruction, read_reconstruction, write_reconstruction,
 };
 pub use submap::{decode_submap, encode_submap, read_submap_report};
+
+#[cfg(test)]
+mod tests;
