@@ -47,6 +47,7 @@ fn config(threads: u32) -> RunConfig {
     let mut config = RunConfig { photos: photographs().0.path().to_path_buf(), ..Default::default() };
     config.workers.threads = threads;
     config.features.images_per_task = 5;
+    config.features.sift.max_features = 1200;
     config.partition.max_cluster_size = 9;
     config.partition.min_overlap_images = 4;
     config

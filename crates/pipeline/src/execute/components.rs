@@ -61,7 +61,7 @@ pub(super) fn average(
     submaps: &[ArtefactKey],
     seams: &[(u32, u32, ArtefactKey)],
 ) -> Result<Made, PipelineError> {
-    let table = read::table(store, table_key)?.table;
+    let table = context.table(store, table_key)?;
     let mut report = AverageReport::default();
     let mut summaries = Vec::new();
     let mut first_of = Vec::new();
@@ -178,7 +178,7 @@ pub(super) fn adjust(
     (average, component): (&ArtefactKey, u32),
     merge: &ArtefactKey,
 ) -> Result<Made, PipelineError> {
-    let table = read::table(store, table_key)?.table;
+    let table = context.table(store, table_key)?;
     let placement = read::placement(store, average)?;
     let shared: Vec<Vec<Vec<ImageId>>> = read::record(store, average, Kind::Reconstruction, read::SHARED)?;
     let georeferenced = matches!(
@@ -227,7 +227,7 @@ pub(super) fn georegister(
     adjusted: &ArtefactKey,
     component: u32,
 ) -> Result<Made, PipelineError> {
-    let table = read::table(store, table_key)?.table;
+    let table = context.table(store, table_key)?;
     let sharded = Sharded::open(store, adjusted)?;
     let cameras = sharded.cameras()?;
     let mut cameras = MergedCameras { cameras: cameras.cameras, images: cameras.images };

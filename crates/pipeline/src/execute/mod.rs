@@ -10,14 +10,14 @@ mod shards;
 mod submaps;
 
 use std::panic::AssertUnwindSafe;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 
-use terrane_scene::SceneError;
+use terrane_scene::{ImageTable, SceneError};
 
 pub(crate) use report::RunReport;
 
-use crate::{PipelineError, Put, RunConfig, Store, Task, TaskError, TaskReport, TaskSpec};
+use crate::{ArtefactKey, PipelineError, Put, RunConfig, Store, Task, TaskError, TaskReport, TaskSpec};
 
 /// Tells tasks to stop. Clones share the signal.
 #[derive(Clone, Debug, Default)]
@@ -46,6 +46,7 @@ pub struct ExecutionContext {
     /// The signal to stop.
     pub cancel: Cancel,
     pool: rayon::ThreadPool,
+    table: Mutex<Option<(ArtefactKey, Arc<ImageTable>)>>,
 }
 
 impl ExecutionContext {
@@ -65,7 +66,20 @@ impl ExecutionContext {
             .map_err(|error| {
                 PipelineError::storage(format!("threads for computing can't be had: {error}"))
             })?;
-        Ok(Self { config, cancel, pool })
+        Ok(Self { config, cancel, pool, table: Mutex::new(None) })
+    }
+
+    /// The run's image table, which nearly every task reads: decoded once.
+    pub(crate) fn table(&self, store: &Store, key: &ArtefactKey) -> Result<Arc<ImageTable>, PipelineError> {
+        let mut cached = self.table.lock().unwrap_or_else(PoisonError::into_inner);
+        match &*cached {
+            Some((of, table)) if of == key => Ok(table.clone()),
+            _ => {
+                let table = Arc::new(read::table(store, key)?.table);
+                *cached = Some((*key, table.clone()));
+                Ok(table)
+            }
+        }
     }
 }
 

@@ -1,6 +1,7 @@
 //! The stages that look at pixels and descriptors: features, pairs, match.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 
 use rayon::prelude::*;
 use terrane_frontend::verification::{Candidate, NotVerified, View, verify};
@@ -24,7 +25,7 @@ pub(super) fn features(
     first: ImageId,
     count: u32,
 ) -> Result<Made, PipelineError> {
-    let table = read::table(store, table_key)?.table;
+    let table = context.table(store, table_key)?;
     let images: Vec<ImageId> = (first.0..first.0 + count).map(ImageId).collect();
     if images.iter().any(|image| image.index() >= table.images.len()) {
         return Err(PipelineError::bug(format!("images from {first} are not in the table")));
@@ -85,7 +86,7 @@ pub(super) fn pairs(
     features: &FeatureSet,
     lost: &[(ImageId, u32, String)],
 ) -> Result<Made, PipelineError> {
-    let table = read::table(store, table_key)?.table;
+    let table = context.table(store, table_key)?;
     let options = &context.config.pairs;
     let mut info = PairsInfo { num_features: vec![0; table.images.len()], ..Default::default() };
     for (first, count, reason) in lost {
@@ -156,7 +157,7 @@ pub(super) fn matching(
     block: u32,
     features: &FeatureSet,
 ) -> Result<Made, PipelineError> {
-    let table = read::table(store, table_key)?.table;
+    let table = context.table(store, table_key)?;
     let (blocks, _) = read::pairs(store, pairs_key)?;
     let pairs = blocks
         .get(block as usize)
@@ -164,8 +165,8 @@ pub(super) fn matching(
     let mut images: BTreeMap<ImageId, Features> = BTreeMap::new();
     for pair in pairs {
         for image in [pair.first(), pair.second()] {
-            if !images.contains_key(&image) {
-                images.insert(image, read::features(store, features, image)?);
+            if let Entry::Vacant(vacant) = images.entry(image) {
+                vacant.insert(read::features(store, features, image)?);
             }
         }
     }

@@ -20,7 +20,7 @@ pub(super) fn submap(
     let TaskSpec::Submap { table, view_graph, partition, cluster, features, matches } = spec else {
         return Err(PipelineError::bug("a submap task is not one"));
     };
-    let table = read::table(store, table)?.table;
+    let table = context.table(store, table)?;
     let partition = read::partition(store, partition)?;
     let images = partition
         .clusters

@@ -84,7 +84,8 @@ impl<'a> Planner<'a> {
             return Ok(None);
         };
         let graph = GraphKeys { table: table_key, view_graph, partition: partition_key };
-        let Some(submaps) = self.submaps(&graph, &table, &partition, &blocks, &matches, &features)? else {
+        let matched = Matched { blocks: &blocks, matches: &matches, features: &features };
+        let Some(submaps) = self.submaps(&graph, &table, &partition, &matched)? else {
             return Ok(None);
         };
         let mut run = FinishedRun {
@@ -136,7 +137,6 @@ impl<'a> Planner<'a> {
         Ok(Some((key, table)))
     }
 
-    #[expect(clippy::type_complexity, reason = "batches, and those that are lost")]
     fn features(
         &mut self,
         table_key: ArtefactKey,
@@ -357,6 +357,14 @@ struct GraphKeys {
     table: ArtefactKey,
     view_graph: ArtefactKey,
     partition: ArtefactKey,
+}
+
+/// What submaps are made of.
+struct Matched<'a> {
+    blocks: &'a [Vec<ImagePair>],
+    /// The match artefact of each block, `None` for those set aside.
+    matches: &'a [Option<ArtefactKey>],
+    features: &'a FeatureSet,
 }
 
 /// What became of the clusters and their seams.

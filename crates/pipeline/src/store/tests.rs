@@ -5,7 +5,7 @@ use super::*;
 fn conforms(store: &Store) {
     assert_eq!(store.get("a/b").unwrap(), None);
     assert_eq!(store.head("a/b").unwrap(), None);
-    assert_eq!(store.get_ranges("a/b", &[0..1]).unwrap(), None);
+    assert_eq!(store.get_ranges("a/b", &[0..1, 1..2]).unwrap(), None);
     assert_eq!(store.put_if_absent("a/b", vec![1u8, 2, 3]).unwrap(), Put::Written);
     assert_eq!(store.put_if_absent("a/b", vec![9u8]).unwrap(), Put::Existed);
     assert_eq!(store.get("a/b").unwrap().unwrap().as_ref(), [1, 2, 3]);

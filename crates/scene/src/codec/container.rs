@@ -398,7 +398,7 @@ fn check_header(header: &Header, len: u64, kind: Kind) -> Result<(), SceneError>
 
 fn check_entry(entry: &Entry, table_end: u64, len: u64) -> Result<(), SceneError> {
     let fits = entry.offset >= table_end
-        && entry.offset % ALIGNMENT == 0
+        && entry.offset.is_multiple_of(ALIGNMENT)
         && entry.offset <= len
         && entry.stored_len <= len - entry.offset
         && pad(entry.stored_len) <= len - entry.offset;
@@ -407,7 +407,7 @@ fn check_entry(entry: &Entry, table_end: u64, len: u64) -> Result<(), SceneError
         1 => entry.len <= entry.stored_len.saturating_mul(MAX_RATIO),
         _ => false,
     };
-    let whole = entry.element_len > 0 && entry.len % u64::from(entry.element_len) == 0;
+    let whole = entry.element_len > 0 && entry.len.is_multiple_of(u64::from(entry.element_len));
     if fits && plausible && whole {
         Ok(())
     } else {

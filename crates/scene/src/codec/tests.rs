@@ -10,12 +10,13 @@ use terrane_geometry::{Camera, CameraModel, Rigid3, so3};
 
 use super::*;
 use crate::{
-    CameraId, ClusterId, Features, ImageFate, ImageId, ImagePair, Keypoint, MatchedPair, Observation, PairKind,
-    PairSummary, Reconstruction, RegisteredImage, SceneError, Submap, SubmapOutcome,
+    CameraId, ClusterId, Features, ImageFate, ImageId, ImagePair, Keypoint, MatchedPair, Observation,
+    PairKind, PairSummary, Reconstruction, RegisteredImage, SceneError, Submap, SubmapOutcome,
 };
 
 fn features(count: u32) -> Features {
-    let keypoint = |n: u32| Keypoint { x_px: n as f32 + 0.5, y_px: 2.5, scale_px: 1.5, orientation_rad: -0.25 };
+    let keypoint =
+        |n: u32| Keypoint { x_px: n as f32 + 0.5, y_px: 2.5, scale_px: 1.5, orientation_rad: -0.25 };
     Features {
         keypoints: (0..count).map(keypoint).collect(),
         descriptors: (0..count * 128).map(|n| (n % 251) as u8).collect(),
@@ -53,7 +54,8 @@ fn block() -> MatchBlock {
 }
 
 fn reconstruction(offset: u32) -> Reconstruction {
-    let camera = Camera::new(CameraModel::OpenCv, 640, 480, &[500.0, 501.0, 320.0, 240.0, 0.1, 0.01, 1e-3, 2e-3]);
+    let camera =
+        Camera::new(CameraModel::OpenCv, 640, 480, &[500.0, 501.0, 320.0, 240.0, 0.1, 0.01, 1e-3, 2e-3]);
     let mut made = Reconstruction { cameras: vec![(CameraId(2), camera.unwrap())], ..Default::default() };
     for image in [1, 4] {
         let rotation = so3::exp(&Vector3::new(0.1 * f64::from(image), 0.7, -0.2));
@@ -164,7 +166,9 @@ impl Source for Watched<'_> {
         ranges: &[Range<u64>],
     ) -> Result<Vec<Box<dyn AsRef<[u8]> + '_>>, Box<dyn std::error::Error + Send + Sync>> {
         *self.1.borrow_mut() += ranges.iter().map(|range| range.end - range.start).sum::<u64>();
-        (&self.0).read(ranges).map(|parts| parts.into_iter().map(|part| Box::new(part.as_ref().as_ref().to_vec()) as _).collect())
+        (&self.0).read(ranges).map(|parts| {
+            parts.into_iter().map(|part| Box::new(part.as_ref().as_ref().to_vec()) as _).collect()
+        })
     }
 }
 

@@ -79,7 +79,8 @@ fn read_images(
         }
         let translation = Vector3::new(f64_of(&mut file)?, f64_of(&mut file)?, f64_of(&mut file)?);
         let quaternion = Quaternion::new(q[0], q[1], q[2], q[3]);
-        if !((quaternion.norm() - 1.0).abs() < 1e-3) {
+        let is_unit = (quaternion.norm() - 1.0).abs() < 1e-3;
+        if !is_unit {
             return Err(SceneError::corrupt(format!(
                 "the rotation of image {} is no unit quaternion",
                 image.0 + 1

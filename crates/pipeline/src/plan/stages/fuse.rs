@@ -4,24 +4,23 @@ use super::*;
 
 impl Planner<'_> {
     /// Submaps, and each seam as soon as both of its submaps are there.
-    #[expect(clippy::too_many_arguments, reason = "everything before it bears on a submap")]
     pub(super) fn submaps(
         &mut self,
         graph: &GraphKeys,
         table: &TableArtefact,
         partition: &Arc<Partition>,
-        blocks: &[Vec<ImagePair>],
-        matches: &[Option<ArtefactKey>],
-        features: &FeatureSet,
+        matched: &Matched<'_>,
     ) -> Step<Submaps> {
         let blocks_of = self.known.remember(graph.partition, "blocks of clusters", || {
-            Ok(blocks_of_clusters(partition, table.table.images.len(), blocks))
+            Ok(blocks_of_clusters(partition, table.table.images.len(), matched.blocks))
         })?;
         let mut items = Vec::new();
         for cluster in &partition.clusters {
-            let wanted: Vec<ArtefactKey> =
-                blocks_of[cluster.id.index()].iter().filter_map(|block| matches[*block as usize]).collect();
-            let part = features.only(cluster.images.iter().copied());
+            let wanted: Vec<ArtefactKey> = blocks_of[cluster.id.index()]
+                .iter()
+                .filter_map(|block| matched.matches[*block as usize])
+                .collect();
+            let part = matched.features.only(cluster.images.iter().copied());
             let key = KeyBuilder::new(Stage::Submap)
                 .value(&self.config.mapping)?
                 .number(self.config.seed)
