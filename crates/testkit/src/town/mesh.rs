@@ -29,6 +29,7 @@ pub(super) struct Triangle {
 pub(super) struct Mesh {
     pub triangles: Vec<Triangle>,
     pub textures: Vec<Texture>,
+    texels_per_m: f64,
 }
 
 /// Height of the terrain in metres.
@@ -43,8 +44,8 @@ fn light(normal: &Vector3<f64>) -> f32 {
 
 impl Mesh {
     /// Terrain under the flight lines, which cover `extent_m` from the origin, with a house in most blocks' corners.
-    pub fn town(extent_m: &Vector3<f64>, seed: Seed) -> Self {
-        let mut mesh = Self { triangles: Vec::new(), textures: Vec::new() };
+    pub fn town(extent_m: &Vector3<f64>, texels_per_m: f64, seed: Seed) -> Self {
+        let mut mesh = Self { triangles: Vec::new(), textures: Vec::new(), texels_per_m };
         let low = [-MARGIN_M, -MARGIN_M];
         let size = [extent_m.x + 2.0 * MARGIN_M, extent_m.y + 2.0 * MARGIN_M];
         mesh.terrain(low, size, seed.derive("ground"));
@@ -84,7 +85,7 @@ impl Mesh {
 
     fn terrain(&mut self, low: [f64; 2], size: [f64; 2], seed: Seed) {
         let texture = self.textures.len();
-        self.textures.push(Texture::paint(Material::Ground, low, size, 12.0, seed));
+        self.textures.push(Texture::paint(Material::Ground, low, size, self.texels_per_m, seed));
         let cells = size.map(|length| (length / CELL_M).ceil() as usize);
         let corner = |i: usize, j: usize| {
             let uv_m = [(i as f64 * CELL_M).min(size[0]), (j as f64 * CELL_M).min(size[1])];
@@ -119,7 +120,7 @@ impl Mesh {
         let low = [0, 1].map(|axis| uv.iter().map(|p| p[axis]).fold(f64::INFINITY, f64::min));
         let size = [0, 1].map(|axis| uv.iter().map(|p| p[axis] - low[axis]).fold(0.2, f64::max));
         let texture = self.textures.len();
-        self.textures.push(Texture::paint(material, [0.0, 0.0], size, 14.0, seed));
+        self.textures.push(Texture::paint(material, [0.0, 0.0], size, 1.2 * self.texels_per_m, seed));
         let corner = |k: usize| Corner { x_in_enu: points[k], uv_m: [uv[k][0] - low[0], uv[k][1] - low[1]] };
         self.quad([corner(0), corner(1), corner(2), corner(3)], texture);
     }

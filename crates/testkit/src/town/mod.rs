@@ -41,6 +41,8 @@ pub struct TownOptions {
     pub distortion: f64,
     /// Standard deviation of the receiver per horizontal axis; twice that in height.
     pub gps_sigma_m: f64,
+    /// Detail of the ground's texture, per metre; walls and roofs have a little more.
+    pub texels_per_m: f64,
     /// Standard deviation of the sensor's noise in grey levels.
     pub noise_levels: f64,
     /// Everything random comes from here.
@@ -60,6 +62,7 @@ impl Default for TownOptions {
             focal_px: 1000.0,
             distortion: -0.04,
             gps_sigma_m: 1.0,
+            texels_per_m: 12.0,
             noise_levels: 1.5,
             seed: Seed(2026),
         }
@@ -85,14 +88,14 @@ pub struct Town {
 }
 
 impl Town {
-    /// Builds the town: a second or two, and about 100 MiB of textures.
+    /// Builds the town: by default a second or two, and about 100 MiB of textures.
     pub fn new(options: &TownOptions) -> Self {
         let extent = Vector3::new(
             (options.columns.max(1) - 1) as f64 * options.spacing_m,
             (options.rows.max(1) - 1) as f64 * options.row_spacing_m,
             options.height_m,
         );
-        let mesh = Mesh::town(&extent, options.seed.derive("town"));
+        let mesh = Mesh::town(&extent, options.texels_per_m, options.seed.derive("town"));
         Self { options: options.clone(), mesh, frame: EnuFrame::new(Self::origin()) }
     }
 

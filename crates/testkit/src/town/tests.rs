@@ -3,7 +3,15 @@
 use super::*;
 
 fn small() -> TownOptions {
-    TownOptions { rows: 1, columns: 2, width_px: 320, height_px: 240, focal_px: 270.0, ..Default::default() }
+    TownOptions {
+        rows: 1,
+        columns: 2,
+        width_px: 320,
+        height_px: 240,
+        focal_px: 270.0,
+        texels_per_m: 4.0,
+        ..Default::default()
+    }
 }
 
 #[test]
