@@ -11,7 +11,7 @@ fn main() {
     let mut options = SiftOptions::default();
     let mut files = Vec::new();
     let mut arguments = std::env::args().skip(1);
-    let mut value = |name: &str, arguments: &mut dyn Iterator<Item = String>| -> String {
+    let value = |name: &str, arguments: &mut dyn Iterator<Item = String>| -> String {
         arguments.next().unwrap_or_else(|| panic!("{name} needs a value"))
     };
     let mut out_dir = None;

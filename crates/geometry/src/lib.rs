@@ -3,9 +3,6 @@
 //! This crate knows no images, files, threads or ids: numbers in, numbers out. Frames, units and signs follow
 //! `docs/conventions.md`.
 
-// `!(a > b)` is how values that are not numbers end on the refusing side.
-#![allow(clippy::neg_cmp_op_on_partial_ord)]
-
 pub mod absolute_pose;
 pub mod alignment;
 pub mod camera;

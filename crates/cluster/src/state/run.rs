@@ -425,10 +425,7 @@ impl Run {
     pub(super) fn status(&self) -> RunStatus {
         let mut stages = self.stages.clone();
         for row in &mut stages {
-            let tasks = |keys: &mut dyn Iterator<Item = &TaskKey>| {
-                keys.filter(|key| self.stage(key) == row.stage).count() as u64
-            };
-            row.running = tasks(&mut self.running.iter());
+            row.running = self.running.iter().filter(|key| self.stage(key) == row.stage).count() as u64;
         }
         for entry in self.entries.values() {
             if let Item::GaveUp(_) = entry.item

@@ -26,7 +26,7 @@ pub(super) fn exp_f32(x: f32) -> f32 {
     const MAGIC: f32 = 12_582_912.0;
     let shifted = x.mul_add(std::f32::consts::LOG2_E, MAGIC);
     let power = shifted - MAGIC;
-    let rest = power.mul_add(-0.693_147_2, x);
+    let rest = power.mul_add(-std::f32::consts::LN_2, x);
     let mut sum = 1.0 / 720.0_f32;
     for term in [1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0] {
         sum = sum.mul_add(rest, term);

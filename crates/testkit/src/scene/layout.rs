@@ -100,7 +100,7 @@ fn pose(options: &SceneOptions, index: usize, seed: &mut Seed) -> Rigid3 {
         }
         Layout::Street { spacing_m, half_width_m } => {
             let center = Vector3::new(index as f64 * spacing_m, 0.0, 1.7) + jitter(rng, 0.05 * half_width_m);
-            let side = if index % 2 == 0 { 0.6 } else { -0.6 };
+            let side = if index.is_multiple_of(2) { 0.6 } else { -0.6 };
             look(center, Vector3::new(1.0, side, 0.1) + jitter(rng, 0.02), up)
         }
         Layout::Panorama { step_rad } => {
