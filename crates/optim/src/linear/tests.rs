@@ -1,3 +1,5 @@
+//! Sparse solves against dense ones.
+
 use nalgebra::{DMatrix, DVector};
 use rand::RngExt;
 use terrane_geometry::Seed;

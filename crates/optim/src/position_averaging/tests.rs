@@ -1,3 +1,5 @@
+//! Positions recovered from directions and baselines, with outliers and gauges.
+
 use rand::RngExt;
 use terrane_geometry::Seed;
 

@@ -1,3 +1,5 @@
+//! Rotations recovered from relative ones, with noise, outliers and several components.
+
 use rand::RngExt;
 use terrane_geometry::Seed;
 

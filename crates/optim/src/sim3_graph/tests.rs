@@ -1,3 +1,5 @@
+//! Similarities recovered from a graph, with wrong edges and satellite positions.
+
 use nalgebra::{SMatrix, SVector, UnitQuaternion};
 use rand::RngExt;
 use terrane_geometry::{Seed, so3};
