@@ -104,8 +104,10 @@ fn measure(set: &Set, terrane: &Path, python: Option<&Path>) -> anyhow::Result<V
     let mut rows = figures(set, judged.as_ref(), &report);
     rows.push(Row::new(format!("{}: wall", set.name), Some(usage.wall_s), "s", wall_bar(set)));
     rows.push(Row::new(format!("{}: CPU", set.name), Some(usage.cpu_s), "s", Bar::None));
-    let peak_mib = usage.peak_bytes as f64 / f64::from(1 << 20);
-    rows.push(Row::new(format!("{}: peak of one process", set.name), Some(peak_mib), "MiB", Bar::None));
+    let peaks = report["costs"]["peak_bytes"].as_object();
+    let peak = peaks.and_then(|peaks| peaks.values().filter_map(Value::as_f64).reduce(f64::max));
+    let peak_mib = peak.map(|bytes| bytes / f64::from(1 << 20));
+    rows.push(Row::new(format!("{}: peak of one process", set.name), peak_mib, "MiB", Bar::None));
     Ok(rows.into_iter().map(|row| row.command(&command)).collect())
 }
 

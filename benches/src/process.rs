@@ -13,11 +13,10 @@ pub struct Usage {
     pub wall_s: f64,
     /// User and system time in seconds, of the process and those it waited for.
     pub cpu_s: f64,
-    /// Largest resident size of any single process, in bytes.
-    pub peak_bytes: u64,
 }
 
-fn children() -> (f64, u64) {
+/// User and system time of the children waited for, in seconds.
+fn children_cpu_s() -> f64 {
     // SAFETY: getrusage only fills the structure it is given, and zero is a valid value of every field.
     let usage = unsafe {
         let mut usage: libc::rusage = std::mem::zeroed();
@@ -25,7 +24,7 @@ fn children() -> (f64, u64) {
         usage
     };
     let seconds = |time: libc::timeval| time.tv_sec as f64 + time.tv_usec as f64 * 1e-6;
-    (seconds(usage.ru_utime) + seconds(usage.ru_stime), usage.ru_maxrss as u64 * 1024)
+    seconds(usage.ru_utime) + seconds(usage.ru_stime)
 }
 
 /// Runs a command to its end and returns what it used and printed.
@@ -33,20 +32,20 @@ fn children() -> (f64, u64) {
 /// # Errors
 /// When it can't be started or does not succeed; the error holds the end of what it printed.
 pub fn run(command: &mut Command) -> anyhow::Result<(Usage, String)> {
-    let (cpu_before_s, _) = children();
+    let cpu_before_s = children_cpu_s();
     let start = Instant::now();
     let output = command
         .stdin(Stdio::null())
         .output()
         .with_context(|| format!("{} can't be started", command.get_program().to_string_lossy()))?;
     let wall_s = start.elapsed().as_secs_f64();
-    let (cpu_after_s, peak_bytes) = children();
+    let cpu_s = children_cpu_s() - cpu_before_s;
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     if !output.status.success() {
         let errors = String::from_utf8_lossy(&output.stderr);
         bail!("{command:?} ended with {}:\n{text}\n{errors}", output.status);
     }
-    Ok((Usage { wall_s, cpu_s: cpu_after_s - cpu_before_s, peak_bytes }, text))
+    Ok((Usage { wall_s, cpu_s }, text))
 }
 
 /// The release binary of terrane, built if need be.
