@@ -1,6 +1,7 @@
 //! Helpers shared by the whole-system tests: the binary under test, the photographs with known answers, the judge.
 
 pub mod judge;
+pub mod processes;
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
