@@ -7,23 +7,20 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
 
-/// The `terrane` binary, built once in the profile of the tests.
+/// The `terrane` binary as its users build it: optimised, with the features of the binary alone.
 pub fn binary() -> &'static Path {
     static BINARY: OnceLock<PathBuf> = OnceLock::new();
     BINARY.get_or_init(|| {
         let mut build = Command::new(env!("CARGO"));
         build.args([
             "build",
-            "--offline",
+            "--release",
             "--package",
             "terrane-cli",
             "--bin",
             "terrane",
             "--message-format=json",
         ]);
-        if !cfg!(debug_assertions) {
-            build.arg("--release");
-        }
         let output = build.current_dir(root()).output().expect("cargo runs");
         assert!(
             output.status.success(),

@@ -172,14 +172,15 @@ impl Served {
 
     fn start_at(engine: &ToyEngine, at: &str, token: Token) -> Self {
         let policy = Policy {
-            silence_ms: 400,
+            // Long against a busy machine's hiccups, short against a person's patience.
+            silence_ms: 2_000,
             heartbeat_ms: 50,
             wait_ms: 200,
             first_backoff_ms: 10,
             ..Policy::default()
         };
         let options =
-            CoordinatorOptions { policy, token: Some(token.clone()), ..CoordinatorOptions::default() };
+            CoordinatorOptions { policy, token: Some(token.clone()), farewell: Duration::from_secs(15) };
         let coordinator = Coordinator::new(Arc::new(engine.clone()), options);
         let listener = std::net::TcpListener::bind(at).unwrap();
         listener.set_nonblocking(true).unwrap();

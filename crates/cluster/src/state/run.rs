@@ -135,12 +135,13 @@ impl Run {
                 ..old
             });
         }
-        // Tasks that were done while the plan was made are not in its figures.
+        // Tasks that were done while the plan was made may be in its figures or not: the next plan knows, until then no
+        // stage has more done than it has tasks.
         for key in &self.news.done {
             if let Some(entry) = self.entries.get(key)
                 && let Some(stage) = self.stages.iter_mut().find(|stage| stage.stage == entry.task.stage)
             {
-                stage.done += 1;
+                stage.done = stage.total.min(stage.done + 1);
             }
         }
     }
