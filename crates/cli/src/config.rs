@@ -105,9 +105,9 @@ fn set_number(config: &mut RunConfig, key: &str, number: u64) -> Result<(), Fail
 fn set_value(config: &mut RunConfig, key: &str, leaf: Value) -> Result<(), Failure> {
     let bug = |error: serde_json::Error| Failure::input(format!("{key}: {error}"));
     let mut value = serde_json::to_value(&*config).map_err(bug)?;
-    let nested = key.rsplit('.').fold(leaf, |inner, part| {
-        Value::Object([(part.to_owned(), inner)].into_iter().collect())
-    });
+    let nested = key
+        .rsplit('.')
+        .fold(leaf, |inner, part| Value::Object([(part.to_owned(), inner)].into_iter().collect()));
     merge(&mut value, nested, "").map_err(Failure::input)?;
     *config = serde_json::from_value(value).map_err(bug)?;
     Ok(())

@@ -7,13 +7,12 @@
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
 use rayon::prelude::*;
 use terrane_frontend::pairs::{PairMode, PairOptions, select};
 use terrane_frontend::retrieval::{
-    CompactDescriptors, Projection, RetrievalOptions, Similar, Sketch, Vocabulary, VocabularyOptions, nearest,
-    refine, sample,
+    CompactDescriptors, Projection, RetrievalOptions, Similar, Sketch, Vocabulary, VocabularyOptions,
+    nearest, refine, sample,
 };
 use terrane_frontend::verification::{Candidate, View, verify};
 use terrane_frontend::{cameras, image, matching, metadata, sift};
@@ -154,7 +153,7 @@ fn load(bytes: &[u8]) -> Option<Features> {
 /// Lists of similar images at each step, with what they cost.
 fn similar(features: &[Features], flags: &Flags) -> Vec<(String, Vec<Vec<Similar>>)> {
     let seed = Seed(0).derive("pairs");
-    let started = Instant::now();
+    let started = cpu_s();
     let per_image = (flags.vocabulary.num_samples as usize).div_ceil(features.len().max(1));
     let sampled: Vec<u8> = features
         .iter()
@@ -165,17 +164,18 @@ fn similar(features: &[Features], flags: &Flags) -> Vec<(String, Vec<Vec<Similar
     if let Some(path) = &flags.save_words {
         std::fs::write(path, vocabulary.words().as_flattened()).expect("writable words");
     }
-    println!("vocabulary of {} words: {:.2} s", vocabulary.num_words(), started.elapsed().as_secs_f64());
-    let started = Instant::now();
+    println!("vocabulary of {} words: {:.2} CPU-s", vocabulary.num_words(), cpu_s() - started);
+    let started = cpu_s();
     let encoded: Vec<Vec<f32>> = features.par_iter().map(|features| vocabulary.encode(features)).collect();
-    println!("encoding: {:.2} s", started.elapsed().as_secs_f64());
-    let started = Instant::now();
-    let projection = Projection::train(&encoded, flags.retrieval.dimensions as usize, seed.derive("projection"));
+    println!("encoding: {:.2} CPU-s", cpu_s() - started);
+    let started = cpu_s();
+    let projection =
+        Projection::train(&encoded, flags.retrieval.dimensions as usize, seed.derive("projection"));
     let mut short = CompactDescriptors::new(projection.dimensions());
     for descriptor in &encoded {
         short.push(&projection.project(descriptor));
     }
-    println!("projection to {}: {:.2} s", projection.dimensions(), started.elapsed().as_secs_f64());
+    println!("projection to {}: {:.2} CPU-s", projection.dimensions(), cpu_s() - started);
     let count = 60.max(flags.retrieval.candidates as usize);
     let global = nearest(&short, |_| true, count, seed.derive("nearest"));
     let sketches: Vec<Sketch> = features
@@ -185,10 +185,10 @@ fn similar(features: &[Features], flags: &Flags) -> Vec<(String, Vec<Vec<Similar
     let mut lists = vec![("global descriptors".to_owned(), global.clone())];
     for rounds in 0..=flags.retrieval.rounds {
         let options = RetrievalOptions { rounds, ..flags.retrieval.clone() };
-        let started = Instant::now();
+        let started = cpu_s();
         let load = |image: usize| Ok::<_, ()>(sketches[image].clone());
         let refined = refine(global.clone(), count, &options, load).expect("sketches are there");
-        println!("{rounds} rounds: {:.2} s", started.elapsed().as_secs_f64());
+        println!("{rounds} rounds: {:.2} CPU-s", cpu_s() - started);
         lists.push((format!("looked at, {rounds} rounds"), refined));
     }
     lists
@@ -200,7 +200,7 @@ fn make_truth(table: &ImageTable, features: &[Features], path: &Path) {
     let mode = if has_gps { PairMode::Gps } else { PairMode::Exhaustive };
     let options = PairOptions { mode, footprints: false, ..PairOptions::default() };
     let pairs = select(table, None, &options).pairs;
-    let started = Instant::now();
+    let started = cpu_s();
     let inliers = |pair: &terrane_scene::ImagePair| -> Option<usize> {
         let view = |image: terrane_scene::ImageId| View {
             camera: table.camera_of(image),
@@ -226,7 +226,7 @@ fn make_truth(table: &ImageTable, features: &[Features], path: &Path) {
         }
     }
     std::fs::write(path, text).expect("writable truth");
-    println!("matched {} pairs in {:.1} s", pairs.len(), started.elapsed().as_secs_f64());
+    println!("matched {} pairs in {:.1} CPU-s", pairs.len(), cpu_s() - started);
 }
 
 fn read_truth(table: &ImageTable, path: &Path) -> Vec<(usize, usize)> {
@@ -254,4 +254,12 @@ fn recall(lists: &[Vec<Similar>], truth: &[(usize, usize)], count: usize) -> f64
     }
     let hits = truth.iter().filter(|&&(a, b)| found.contains(&(a.min(b), a.max(b)))).count();
     hits as f64 / truth.len().max(1) as f64
+}
+
+/// CPU seconds of all threads of this process, from the kernel's books (Linux; zero elsewhere).
+fn cpu_s() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
+    let ticks: u64 = [11, 12].iter().filter_map(|&k| fields.get(k)?.parse::<u64>().ok()).sum();
+    ticks as f64 / 100.0
 }

@@ -6,6 +6,8 @@ mod gps;
 #[cfg(test)]
 mod tests;
 mod xmp;
+#[cfg(test)]
+mod xmp_tests;
 
 use std::io::Cursor;
 

@@ -43,7 +43,8 @@ impl Packet {
 
     /// The first number of a property inside an element.
     fn number_in(&self, element: &str, name: &str) -> Option<f64> {
-        let is_named = |full: &str| full.strip_prefix(element).and_then(|f| f.strip_prefix('/')) == Some(name);
+        let is_named =
+            |full: &str| full.strip_prefix(element).and_then(|f| f.strip_prefix('/')) == Some(name);
         self.numbers.iter().find(|(full, _)| is_named(full)).map(|(_, value)| *value)
     }
 
@@ -103,7 +104,8 @@ impl Packet {
 
     /// Height above ground and attitude, when the packet has either.
     pub(super) fn flight(&self) -> Option<FlightPrior> {
-        let height = ["drone-dji:RelativeAltitude", "drone:RelativeAltitude", "drone-skydio:RelativeAltitude"];
+        let height =
+            ["drone-dji:RelativeAltitude", "drone:RelativeAltitude", "drone-skydio:RelativeAltitude"];
         let above_ground = self.number("Camera:AboveGroundAltitude");
         let height_above_ground_m = above_ground
             .or_else(|| height.iter().find_map(|name| self.number(name)))
@@ -113,7 +115,7 @@ impl Packet {
         (flight != FlightPrior::default()).then_some(flight)
     }
 
-    /// The attitude of a camera on a gimbal.
+    /// The attitude of a camera on a gimbal; three zeros are what a gimbal writes that doesn't know.
     fn gimbal(&self) -> Option<AttitudePrior> {
         let skydio = "drone-skydio:CameraOrientationNED";
         let angles = |of: &dyn Fn(&str) -> Option<f64>| Some((of("Yaw"), of("Pitch")?, of("Roll")));
@@ -124,8 +126,9 @@ impl Packet {
             .or_else(|| angles(&plain("drone:Gimbal", "Degree")))
             .or_else(|| angles(&plain("drone-parrot:Camera", "Degree")))
             .or_else(|| angles(&|axis| self.number_in(skydio, &format!("drone-skydio:{axis}"))))?;
-        Some(AttitudePrior { of: AttitudeOf::Gimbal, yaw_deg, pitch_deg, roll_deg: roll_deg.unwrap_or(0.0) })
-            .filter(|attitude| (attitude.pitch_deg, attitude.roll_deg) != (0.0, 0.0) || attitude.yaw_deg.is_some_and(|yaw| yaw != 0.0))
+        let roll_deg = roll_deg.unwrap_or(0.0);
+        let is_known = [yaw_deg.unwrap_or(0.0), pitch_deg, roll_deg] != [0.0; 3];
+        is_known.then_some(AttitudePrior { of: AttitudeOf::Gimbal, yaw_deg, pitch_deg, roll_deg })
     }
 
     /// The attitude of a craft that its camera is fixed to.
@@ -136,7 +139,7 @@ impl Packet {
     }
 }
 
-/// Three zeros are what gimbals write that don't know; see [`Packet::gimbal`]. Angles beyond a turn are no angles.
+/// Angles beyond a turn are no angles.
 fn is_plausible(attitude: &AttitudePrior) -> bool {
     let is_angle = |degrees: f64| degrees.abs() <= 360.0;
     is_angle(attitude.pitch_deg) && is_angle(attitude.roll_deg) && attitude.yaw_deg.is_none_or(is_angle)

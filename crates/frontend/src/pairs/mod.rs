@@ -5,6 +5,8 @@
 
 mod blocks;
 mod footprint;
+#[cfg(test)]
+mod footprint_tests;
 mod overlap;
 mod places;
 mod sequence;

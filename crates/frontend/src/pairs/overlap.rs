@@ -40,14 +40,15 @@ pub(super) fn neighbours(table: &ImageTable, count: usize, min_overlap: f64) -> 
         footprints.iter().map(|footprint| footprint.as_ref().map(|f| f.center)).collect();
     let places = Places::new(&centers);
     let mut lists = vec![None; table.images.len()];
-    let found: Vec<(usize, Vec<usize>)> = places.map_nearest(CANDIDATES_PER_NEIGHBOUR * count, |image, near| {
-        let Some(footprint) = &footprints[image] else { return Vec::new() };
-        let scored = near.iter().filter_map(|&(_, other)| {
-            let (score, cosine) = alike(footprint, footprints[other].as_ref()?);
-            (score >= min_overlap).then_some(((score * SCORE_STEPS) as u32, cosine < OTHER_SIDE, other))
+    let found: Vec<(usize, Vec<usize>)> =
+        places.map_nearest(CANDIDATES_PER_NEIGHBOUR * count, |image, near| {
+            let Some(footprint) = &footprints[image] else { return Vec::new() };
+            let scored = near.iter().filter_map(|&(_, other)| {
+                let (score, cosine) = alike(footprint, footprints[other].as_ref()?);
+                (score >= min_overlap).then_some(((score * SCORE_STEPS) as u32, cosine < OTHER_SIDE, other))
+            });
+            best(scored.collect(), count)
         });
-        best(scored.collect(), count)
-    });
     for (image, list) in found {
         lists[image] = Some(list);
     }

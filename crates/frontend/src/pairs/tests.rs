@@ -40,7 +40,7 @@ fn plain(count: usize) -> ImageTable {
 }
 
 /// A square grid of positions, `spacing_m` apart, at 45 degrees north across the date line.
-fn grid(side: usize, spacing_m: f64) -> ImageTable {
+pub(super) fn grid(side: usize, spacing_m: f64) -> ImageTable {
     let (north_deg, east_deg) = (spacing_m / 111_132.0, spacing_m / 78_847.0);
     let place = |at: usize| {
         let (row, column) = (at / side, at % side);
@@ -51,7 +51,7 @@ fn grid(side: usize, spacing_m: f64) -> ImageTable {
     table((0..side * side).map(|at| image(&format!("{at:04}.jpg"), Some(place(at)), None)).collect())
 }
 
-fn options(mode: PairMode) -> PairOptions {
+pub(super) fn options(mode: PairMode) -> PairOptions {
     PairOptions { mode, ..PairOptions::default() }
 }
 
@@ -59,7 +59,7 @@ fn similar(index: u32) -> Similar {
     Similar { index, similarity: 0.5, votes: 0 }
 }
 
-fn as_numbers(pairs: &[ImagePair]) -> Vec<(u32, u32)> {
+pub(super) fn as_numbers(pairs: &[ImagePair]) -> Vec<(u32, u32)> {
     pairs.iter().map(|pair| (pair.first().0, pair.second().0)).collect()
 }
 

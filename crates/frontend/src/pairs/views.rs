@@ -76,8 +76,7 @@ fn looking_down(table: &ImageTable) -> Vec<bool> {
         count.0 += 1;
         count.1 += usize::from(tilt_rad(&attitude) <= NADIR_TILT_RAD);
     }
-    let is_down = |&(known, down): &(usize, usize)| {
-        known >= MIN_EVIDENCE && down as f64 >= NADIR_SHARE * known as f64
-    };
+    let is_down =
+        |&(known, down): &(usize, usize)| known >= MIN_EVIDENCE && down as f64 >= NADIR_SHARE * known as f64;
     counts.iter().map(is_down).collect()
 }

@@ -112,8 +112,7 @@ mod x86 {
             let mut sums = [_mm256_setzero_si256(); 2];
             for (at, (q, r)) in query_parts.iter().zip(row.as_chunks::<LANES>().0).enumerate() {
                 let (q, r) = (load(q), load(r));
-                sums[at % 2] =
-                    _mm256_dpbusd_epi32(sums[at % 2], _mm256_abs_epi8(q), _mm256_sign_epi8(r, q));
+                sums[at % 2] = _mm256_dpbusd_epi32(sums[at % 2], _mm256_abs_epi8(q), _mm256_sign_epi8(r, q));
             }
             dots.push(sum(_mm256_add_epi32(sums[0], sums[1])));
         }

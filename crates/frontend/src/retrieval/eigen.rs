@@ -39,7 +39,8 @@ const MAX_SWEEPS: usize = 30;
 /// Loan, section 8.5).
 pub(super) fn symmetric_eigen(matrix: &[f64], n: usize) -> (Vec<f64>, Vec<Vec<f64>>) {
     let mut rows: Vec<Vec<f64>> = matrix.chunks_exact(n.max(1)).map(<[f64]>::to_vec).collect();
-    let mut vectors: Vec<Vec<f64>> = (0..n).map(|k| (0..n).map(|j| f64::from(u8::from(j == k))).collect()).collect();
+    let mut vectors: Vec<Vec<f64>> =
+        (0..n).map(|k| (0..n).map(|j| f64::from(u8::from(j == k))).collect()).collect();
     let scale: f64 = rows.iter().map(|row| dot(row, row)).sum();
     for _ in 0..MAX_SWEEPS {
         let off: f64 = (0..n).map(|p| rows[p][p + 1..].iter().map(|value| value * value).sum::<f64>()).sum();

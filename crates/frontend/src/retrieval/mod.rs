@@ -62,9 +62,9 @@ impl VocabularyOptions {
         let byte = |at: usize| Some((digit(2 * at)? * 16 + digit(2 * at + 1)?) as u8);
         let bytes: Option<Vec<u8>> = (0..hex.len().div_ceil(2)).map(byte).collect();
         let vocabulary = bytes.as_deref().and_then(Vocabulary::from_words);
-        vocabulary.map(Some).ok_or_else(|| {
-            format!("must be 1 to 4,096 words of {DESCRIPTOR_LEN} bytes in hexadecimal")
-        })
+        vocabulary
+            .map(Some)
+            .ok_or_else(|| format!("must be 1 to 4,096 words of {DESCRIPTOR_LEN} bytes in hexadecimal"))
     }
 }
 

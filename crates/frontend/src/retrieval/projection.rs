@@ -69,7 +69,10 @@ impl Projection {
             return Vec::new();
         }
         let centered: Vec<f32> = descriptor.iter().zip(&self.mean).map(|(a, b)| a - b).collect();
-        self.directions.chunks_exact(self.mean.len()).map(|direction| dot(&centered, direction) as f32).collect()
+        self.directions
+            .chunks_exact(self.mean.len())
+            .map(|direction| dot(&centered, direction) as f32)
+            .collect()
     }
 }
 

@@ -129,12 +129,14 @@ impl Graph {
             known.sort_unstable();
             let mut found: Vec<(u32, u32)> = Vec::new();
             for (votes, middle) in self.proposers(image) {
-                let next = self.proposers(middle as usize).map(|(further, other)| (other, votes.min(further)));
+                let next =
+                    self.proposers(middle as usize).map(|(further, other)| (other, votes.min(further)));
                 found.extend(next.filter(|(other, _)| known.binary_search(other).is_err()));
             }
             // Ways to one image add up.
             found.sort_unstable();
-            let sums = found.chunk_by(|a, b| a.0 == b.0).map(|ways| (ways.iter().map(|way| way.1).sum(), ways[0].0));
+            let sums =
+                found.chunk_by(|a, b| a.0 == b.0).map(|ways| (ways.iter().map(|way| way.1).sum(), ways[0].0));
             let mut sums: Vec<(u32, u32)> = sums.collect();
             sums.sort_unstable_by_key(|&(sum, other)| (std::cmp::Reverse(sum), other));
             sums.iter().take(MAX_PROPOSED).filter_map(|&(_, other)| pair(image, other as usize)).collect()
@@ -146,7 +148,10 @@ impl Graph {
     fn ranked(&self, initial: Vec<Vec<Similar>>, count: usize) -> Vec<Vec<Similar>> {
         let of_image = |(image, initial): (usize, Vec<Similar>)| {
             let similarity = |other: u32| {
-                initial.iter().find(|similar| similar.index == other).map_or(0.0, |similar| similar.similarity)
+                initial
+                    .iter()
+                    .find(|similar| similar.index == other)
+                    .map_or(0.0, |similar| similar.similarity)
             };
             let agreeing = self.lists[image].iter().take_while(|entry| entry.0 > VOTES_BY_CHANCE);
             let mut list: Vec<Similar> = agreeing

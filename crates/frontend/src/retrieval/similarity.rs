@@ -123,9 +123,8 @@ impl Cells {
         let mut dots = Vec::with_capacity(self.centers.len());
         self.kernel.dots(query, self.centers.values(), &mut dots);
         let mut order: Vec<usize> = (0..self.centers.len()).collect();
-        let likeness = |cell: usize| {
-            dots.get(cell).map_or(0.0, |&dot| dot as f32 * self.centers.inverse_length(cell))
-        };
+        let likeness =
+            |cell: usize| dots.get(cell).map_or(0.0, |&dot| dot as f32 * self.centers.inverse_length(cell));
         order.sort_by(|&a, &b| likeness(b).total_cmp(&likeness(a)).then(a.cmp(&b)));
         order
     }
@@ -205,7 +204,11 @@ fn assign(
         }
         best.1
     };
-    images.par_chunks(CHUNK).map(|chunk| chunk.iter().map(cell_of).collect::<Vec<_>>()).collect::<Vec<_>>().concat()
+    images
+        .par_chunks(CHUNK)
+        .map(|chunk| chunk.iter().map(cell_of).collect::<Vec<_>>())
+        .collect::<Vec<_>>()
+        .concat()
 }
 
 fn keep_best(list: &mut Vec<Similar>, count: usize) {

@@ -123,7 +123,9 @@ fn dot_products_are_equal_on_every_path() {
         for extreme in [false, true] {
             if extreme {
                 query.iter_mut().for_each(|value| *value = if *value < 0 { -127 } else { 127 });
-                rows.iter_mut().enumerate().for_each(|(at, value)| *value = if at % 7 == 0 { 0 } else { -127 });
+                rows.iter_mut()
+                    .enumerate()
+                    .for_each(|(at, value)| *value = if at % 7 == 0 { 0 } else { -127 });
             }
             let exact: Vec<i32> = rows
                 .chunks_exact(len)
@@ -143,7 +145,8 @@ fn dot_products_are_equal_on_every_path() {
 fn on_a_curve(count: usize) -> CompactDescriptors {
     let mut rng = Seed(15).rng();
     let mut descriptors = CompactDescriptors::new(40);
-    let waves: Vec<[f32; 2]> = (0..40).map(|_| [rng.random_range(0.02..0.5), rng.random_range(0.0..6.0)]).collect();
+    let waves: Vec<[f32; 2]> =
+        (0..40).map(|_| [rng.random_range(0.02..0.5), rng.random_range(0.0..6.0)]).collect();
     for at in 0..count {
         let along = at as f32 * 0.2;
         let numbers: Vec<f32> =
@@ -193,7 +196,9 @@ fn nearest_is_exact_for_a_few_and_nearly_so_for_many() {
 #[test]
 fn nearest_skips_what_can_not_be_compared() {
     let mut descriptors = CompactDescriptors::new(3);
-    for numbers in [&[1.0, 0.1, 0.0][..], &[], &[f32::NAN, 0.0, 0.0], &[0.9, 0.0, 0.1], &[0.0; 3], &[-1.0, 0.0, 0.0]] {
+    for numbers in
+        [&[1.0, 0.1, 0.0][..], &[], &[f32::NAN, 0.0, 0.0], &[0.9, 0.0, 0.1], &[0.0; 3], &[-1.0, 0.0, 0.0]]
+    {
         descriptors.push(numbers);
     }
     descriptors.push(&[1e-42, 0.0, 0.0]);
@@ -214,7 +219,8 @@ fn nearest_skips_what_can_not_be_compared() {
 #[test]
 fn projections_keep_what_varies() {
     let mut rng = Seed(17).rng();
-    let directions: Vec<Vec<f32>> = (0..3).map(|_| (0..200).map(|_| rng.random_range(-1.0..1.0)).collect()).collect();
+    let directions: Vec<Vec<f32>> =
+        (0..3).map(|_| (0..200).map(|_| rng.random_range(-1.0..1.0)).collect()).collect();
     let sample: Vec<Vec<f32>> = (0..60)
         .map(|_| {
             let weights: [f32; 3] = [9.0, 3.0, 1.0].map(|size| rng.random_range(-size..size));
@@ -303,7 +309,12 @@ fn neighbours_of_neighbours_are_found_and_errors_passed_on() {
     let options = RetrievalOptions::default();
     let found = refine(initial.clone(), 8, &options, load).expect("sketches are there");
     let indices = |at: usize| found[at].iter().map(|similar| similar.index).collect::<Vec<_>>();
-    assert_eq!(indices(5)[..2].iter().map(|at| at % 2).sum::<u32>(), 0, "{:?}: 4 and 6 share most", indices(5));
+    assert_eq!(
+        indices(5)[..2].iter().map(|at| at % 2).sum::<u32>(),
+        0,
+        "{:?}: 4 and 6 share most",
+        indices(5)
+    );
     assert!(indices(5).contains(&3) && indices(5).contains(&7), "{:?}", indices(5));
     assert!(!indices(5).contains(&0) && !indices(5).contains(&10), "{:?}", indices(5));
     let with = |threads| {
@@ -319,8 +330,9 @@ fn neighbours_of_neighbours_are_found_and_errors_passed_on() {
 fn the_search_is_the_same_for_any_number_of_threads() {
     let search = || {
         let descriptors = on_a_curve(5_000);
-        let sample: Vec<Vec<f32>> =
-            (0..80).map(|at| descriptors.get(at * 50).iter().map(|&value| f32::from(value)).collect()).collect();
+        let sample: Vec<Vec<f32>> = (0..80)
+            .map(|at| descriptors.get(at * 50).iter().map(|&value| f32::from(value)).collect())
+            .collect();
         let projection = Projection::train(&sample, 16, Seed(25));
         (nearest(&descriptors, |at| at % 7 == 0, 5, Seed(26)), projection)
     };
