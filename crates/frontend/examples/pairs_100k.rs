@@ -47,7 +47,7 @@ fn footprints(num_images: usize) {
         let options = PairOptions { mode: PairMode::Gps, footprints, ..PairOptions::default() };
         let started = cpu_s();
         let selection = select(&table, None, &options);
-        let selected_s = (cpu_s() - started);
+        let selected_s = cpu_s() - started;
         let made = blocks(&selection.pairs, &Default::default());
         println!(
             "{name}: {num_images} images, {} pairs ({} by footprints) in {selected_s:.1} CPU-s, {} blocks in {:.1} CPU-s, peak {} MiB",
@@ -106,7 +106,7 @@ fn projection() {
         (0..1024).map(|_| (0..8192).map(|_| rng.random_range(-0.02..0.02)).collect()).collect();
     let started = cpu_s();
     let projection = Projection::train(&sample, DIMENSIONS, Seed(3));
-    let trained_s = (cpu_s() - started);
+    let trained_s = cpu_s() - started;
     let projected: usize = sample.iter().map(|row| projection.project(row).len()).sum();
     println!(
         "projection: {} dimensions learnt in {trained_s:.1} CPU-s; {:.2} ms an image",

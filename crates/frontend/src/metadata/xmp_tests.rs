@@ -86,7 +86,7 @@ fn damaged_packets_never_panic() {
             bytes[at] = if state & 64 == 0 { b"<>/\"'= \0"[(state >> 3) as usize % 8] } else { state as u8 };
         }
         Packet::find(&bytes).flight();
-        Packet::find(&bytes[..bytes.len() - round % 300]).flight();
+        Packet::find(&bytes[..bytes.len().saturating_sub(round % 400)]).flight();
     }
     let deep = format!("<x:xmpmeta>{}", "<a>".repeat(50_000));
     assert_eq!(Packet::find(deep.as_bytes()).flight(), None);

@@ -160,7 +160,7 @@ fn obliques_are_paired_with_those_that_see_their_ground() {
     let table = flown(12, |at| flight(60.0, if at == 65 { gimbal(90.0, -45.0) } else { gimbal(0.0, -90.0) }));
     let selection = chosen(&table, 6);
     assert_eq!(selection.report.with_footprint, 144);
-    assert!(has(&selection, 65, 68) && has(&selection, 65, 67), "{:?}", as_numbers(&selection.pairs));
+    assert!(has(&selection, 65, 68) && has(&selection, 65, 69), "{:?}", as_numbers(&selection.pairs));
     assert!(!has(&selection, 64, 65) && !has(&selection, 63, 65), "what lies behind it is not seen");
     // Two that look at each other from afar see one ground from opposite sides: nothing would match.
     let table = flown(12, |at| match at {

@@ -21,7 +21,8 @@ pub struct RetrievalOptions {
     /// Most similar images by global descriptor that are looked at closely, for each image; 0 leaves it at the global
     /// descriptors. Default 60.
     pub candidates: u32,
-    /// Features of largest scale that are compared for that, at least 8. Default 256.
+    /// Features of largest scale that are compared for that, at least 8. Default 512: a
+    /// millisecond a pair.
     pub local_features: u32,
     /// Rounds in which the neighbours of neighbours are tried. Default 2.
     pub rounds: u32,
@@ -29,14 +30,16 @@ pub struct RetrievalOptions {
 
 impl Default for RetrievalOptions {
     fn default() -> Self {
-        Self { dimensions: 128, training_images: 1024, candidates: 60, local_features: 256, rounds: 2 }
+        Self { dimensions: 128, training_images: 1024, candidates: 60, local_features: 512, rounds: 2 }
     }
 }
 
 /// Matches that agree by chance; more are evidence.
 const VOTES_BY_CHANCE: u32 = 3;
 /// Neighbours of an image, the best first, that propose their own.
-const PROPOSERS: usize = 12;
+const PROPOSERS: usize = 16;
+/// What a vote between two images counts, in votes by way of a third.
+const OWN_VOTE: u32 = 4;
 /// New candidates of an image in a round.
 const MAX_PROPOSED: usize = 30;
 /// Images whose sketches are in memory together: some 80 MiB.
@@ -120,44 +123,59 @@ impl Graph {
         self.lists[image].iter().copied().take_while(|entry| entry.0 > VOTES_BY_CHANCE).take(PROPOSERS)
     }
 
+    /// Images that have an agreeing neighbour in common with an image: the votes of the weaker step of each way, summed,
+    /// and the other image. Ascending by image.
+    fn by_way_of_others(&self, image: usize) -> Vec<(u32, u32)> {
+        let mut ways: Vec<(u32, u32)> = Vec::new();
+        for (votes, middle) in self.proposers(image) {
+            let next = self.proposers(middle as usize).filter(|&(_, other)| other as usize != image);
+            ways.extend(next.map(|(further, other)| (other, votes.min(further))));
+        }
+        ways.sort_unstable();
+        let sum = |ways: &[(u32, u32)]| (ways.iter().map(|way| way.1).sum(), ways[0].0);
+        ways.chunk_by(|a, b| a.0 == b.0).map(sum).collect()
+    }
+
     /// Pairs of images that have an agreeing neighbour in common and were not looked at, for each image those with the
     /// most votes on the way.
     fn proposals(&self) -> Vec<ImagePair> {
         let of_image = |image: usize| -> Vec<ImagePair> {
             let mut known: Vec<u32> = self.lists[image].iter().map(|entry| entry.1).collect();
-            known.push(image as u32);
             known.sort_unstable();
-            let mut found: Vec<(u32, u32)> = Vec::new();
-            for (votes, middle) in self.proposers(image) {
-                let next =
-                    self.proposers(middle as usize).map(|(further, other)| (other, votes.min(further)));
-                found.extend(next.filter(|(other, _)| known.binary_search(other).is_err()));
-            }
-            // Ways to one image add up.
-            found.sort_unstable();
-            let sums =
-                found.chunk_by(|a, b| a.0 == b.0).map(|ways| (ways.iter().map(|way| way.1).sum(), ways[0].0));
-            let mut sums: Vec<(u32, u32)> = sums.collect();
-            sums.sort_unstable_by_key(|&(sum, other)| (std::cmp::Reverse(sum), other));
-            sums.iter().take(MAX_PROPOSED).filter_map(|&(_, other)| pair(image, other as usize)).collect()
+            let mut found = self.by_way_of_others(image);
+            found.retain(|(_, other)| known.binary_search(other).is_err());
+            found.sort_unstable_by_key(|&(sum, other)| (std::cmp::Reverse(sum), other));
+            found.iter().take(MAX_PROPOSED).filter_map(|&(_, other)| pair(image, other as usize)).collect()
         };
         (0..self.lists.len()).into_par_iter().map(of_image).collect::<Vec<_>>().concat()
     }
 
-    /// Lists of at most `count`: those with evidence by votes, then the others as global descriptors ordered them.
+    /// Lists of at most `count`: those with evidence first, then the others as global descriptors ordered them. Evidence
+    /// is an image's own votes and a part of those by way of common neighbours: of two photographs that share a border
+    /// too narrow for votes, the ones between them know.
     fn ranked(&self, initial: Vec<Vec<Similar>>, count: usize) -> Vec<Vec<Similar>> {
         let of_image = |(image, initial): (usize, Vec<Similar>)| {
+            let mut evidence: Vec<(u32, u32)> = Vec::new();
+            let own = self.lists[image].iter().take_while(|entry| entry.0 > VOTES_BY_CHANCE);
+            evidence.extend(own.map(|&(votes, other)| (other, OWN_VOTE * votes)));
+            evidence.extend(self.by_way_of_others(image).into_iter().map(|(sum, other)| (other, sum)));
+            evidence.sort_unstable();
+            let sum = |parts: &[(u32, u32)]| (parts.iter().map(|part| part.1).sum::<u32>(), parts[0].0);
+            let mut sums: Vec<(u32, u32)> = evidence.chunk_by(|a, b| a.0 == b.0).map(sum).collect();
+            sums.sort_unstable_by_key(|&(sum, other)| (std::cmp::Reverse(sum), other));
             let similarity = |other: u32| {
                 initial
                     .iter()
                     .find(|similar| similar.index == other)
                     .map_or(0.0, |similar| similar.similarity)
             };
-            let agreeing = self.lists[image].iter().take_while(|entry| entry.0 > VOTES_BY_CHANCE);
-            let mut list: Vec<Similar> = agreeing
-                .take(count)
-                .map(|&(votes, index)| Similar { index, similarity: similarity(index), votes })
-                .collect();
+            let votes = |sum: u32| sum.div_ceil(OWN_VOTE);
+            let known = sums.iter().take(count).map(|&(sum, index)| Similar {
+                index,
+                similarity: similarity(index),
+                votes: votes(sum),
+            });
+            let mut list: Vec<Similar> = known.collect();
             for similar in initial.iter() {
                 if list.len() >= count {
                     break;

@@ -18,7 +18,8 @@ pub struct Similar {
     pub index: u32,
     /// Cosine of the angle between the two descriptors: 1 for equal images, about 0 for strangers.
     pub similarity: f32,
-    /// Local features that agree on one place for both images; see [`super::refine`]. 0 when that was not looked at.
+    /// Local features that agree on one place for both images, with a share of those by way of common neighbours; see
+    /// [`super::refine`]. 0 without evidence.
     pub votes: u32,
 }
 
