@@ -63,6 +63,12 @@ pub struct OptionFlags {
     /// Trusted intrinsics of all photographs, as COLMAP writes them: MODEL:p1,p2,…
     #[arg(long, value_name = "MODEL:PARAMS")]
     pub camera: Option<CameraOverride>,
+    /// Match only the pairs of a text file, two paths a line, as COLMAP's lists of pairs.
+    #[arg(long, value_name = "FILE")]
+    pub pairs: Option<PathBuf>,
+    /// Words for retrieval instead of words learnt from the run: a file of descriptors, 128 bytes each.
+    #[arg(long, value_name = "FILE")]
+    pub vocabulary: Option<PathBuf>,
     /// Seed of every random choice [default: 0].
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,

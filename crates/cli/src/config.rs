@@ -52,18 +52,62 @@ pub fn resolve(flags: &OptionFlags) -> Result<RunConfig, Failure> {
     if let Some(camera) = &flags.camera {
         config.camera = Some(camera.clone());
     }
+    if let Some(path) = &flags.pairs {
+        set_pairs(&mut config, path)?;
+    }
+    if let Some(path) = &flags.vocabulary {
+        set_vocabulary(&mut config, path)?;
+    }
     if let Some(seed) = flags.seed {
         config.seed = seed;
     }
     Ok(config)
 }
 
+/// The pairs of a list: two paths a line; the first ends at the first space or tab.
+fn set_pairs(config: &mut RunConfig, path: &Path) -> Result<(), Failure> {
+    let shown = path.display();
+    let text = std::fs::read_to_string(path)
+        .map_err(|error| Failure::input(format!("list of pairs {shown}: {error}")))?;
+    let mut list = Vec::new();
+    for (at, line) in text.lines().map(str::trim).enumerate() {
+        if line.is_empty() || line.starts_with('#') {
+            continue;
+        }
+        let (first, second) = line.split_once([' ', '\t']).ok_or_else(|| {
+            Failure::input(format!("{shown}, line {}: write two paths with a space between them", at + 1))
+        })?;
+        list.push([first.to_owned(), second.trim_start().to_owned()]);
+    }
+    if list.is_empty() {
+        return Err(Failure::input(format!("{shown} lists no pairs: write two paths a line")));
+    }
+    config.pairs.select.list = list;
+    set_value(config, "pairs.select.mode", Value::from("list"))
+}
+
+/// The words of a file, which [`RunConfig::validate`] looks at.
+fn set_vocabulary(config: &mut RunConfig, path: &Path) -> Result<(), Failure> {
+    let bytes = std::fs::read(path)
+        .map_err(|error| Failure::input(format!("vocabulary {}: {error}", path.display())))?;
+    let hex = bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut hex, byte| {
+        hex.extend([byte >> 4, byte & 15].map(|digit| char::from_digit(u32::from(digit), 16).unwrap_or('0')));
+        hex
+    });
+    config.pairs.vocabulary.words = Some(hex);
+    Ok(())
+}
+
 fn set_number(config: &mut RunConfig, key: &str, number: u64) -> Result<(), Failure> {
+    set_value(config, key, Value::from(number))
+}
+
+fn set_value(config: &mut RunConfig, key: &str, leaf: Value) -> Result<(), Failure> {
     let bug = |error: serde_json::Error| Failure::input(format!("{key}: {error}"));
     let mut value = serde_json::to_value(&*config).map_err(bug)?;
-    let nested = key.rsplit('.').fold(Value::from(number), |inner, part| {
-        Value::Object([(part.to_owned(), inner)].into_iter().collect())
-    });
+    let nested = key
+        .rsplit('.')
+        .fold(leaf, |inner, part| Value::Object([(part.to_owned(), inner)].into_iter().collect()));
     merge(&mut value, nested, "").map_err(Failure::input)?;
     *config = serde_json::from_value(value).map_err(bug)?;
     Ok(())

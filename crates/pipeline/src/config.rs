@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use terrane_frontend::image::DecodeOptions;
 use terrane_frontend::matching::MatchOptions;
 use terrane_frontend::pairs::{BlockOptions, PairOptions};
-use terrane_frontend::retrieval::VocabularyOptions;
+use terrane_frontend::retrieval::{RetrievalOptions, VocabularyOptions};
 use terrane_frontend::sift::SiftOptions;
 use terrane_frontend::verification::VerificationOptions;
 use terrane_fusion::adjust::AdjustOptions;
@@ -106,6 +106,8 @@ pub struct PairStageOptions {
     pub select: PairOptions,
     /// Retrieval's vocabulary.
     pub vocabulary: VocabularyOptions,
+    /// How retrieval finds similar images.
+    pub retrieval: RetrievalOptions,
     /// How large a match task is.
     pub blocks: BlockOptions,
 }
@@ -196,9 +198,17 @@ impl RunConfig {
         check(self.workers.threads >= 1, "workers.threads", "at least 1");
         check(self.workers.memory_bytes >= 256 << 20, "workers.memory_bytes", "at least 256 MiB");
         check((1..=1024).contains(&self.features.images_per_task), "features.images_per_task", "1 to 1,024");
+        let retrieval = &self.pairs.retrieval;
+        check((1..=512).contains(&retrieval.dimensions), "pairs.retrieval.dimensions", "1 to 512");
+        check(retrieval.training_images >= 2, "pairs.retrieval.training_images", "at least 2");
+        check(retrieval.local_features >= 8, "pairs.retrieval.local_features", "at least 8");
+        check((0.0..=1.0).contains(&self.pairs.select.min_overlap), "pairs.select.min_overlap", "0 to 1");
         check(self.partition.max_cluster_size >= 8, "partition.max_cluster_size", "at least 8");
         if let Some(Err(error)) = self.camera.as_ref().map(|camera| camera.camera(1, 1)) {
             problems.push(format!("camera: {error}"));
+        }
+        if let Err(rule) = self.pairs.vocabulary.given() {
+            problems.push(format!("pairs.vocabulary.words: {rule}"));
         }
         problems.extend(self.mapping.validate("mapping"));
         problems

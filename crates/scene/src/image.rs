@@ -30,6 +30,40 @@ pub struct GpsPrior {
     pub sigma_vertical_m: f64,
 }
 
+/// What the angles of an [`AttitudePrior`] turn. Angles are applied as yaw, then pitch, then roll, about axes that turn
+/// with the body: yaw clockwise from north seen from above, pitch nose up, roll right side down.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum AttitudeOf {
+    /// A camera that looks ahead: at pitch 0 to the horizon, at -90 straight down (DJI, Autel's newer files, Parrot, Skydio).
+    Gimbal,
+    /// A craft whose camera looks down through its floor, the top of the image ahead: at pitch 0 straight down, at 90 to
+    /// the horizon ahead (the `Camera` schema of Pix4D: senseFly, Parrot Sequoia, MicaSense, Autel's older files).
+    Craft,
+}
+
+/// How a camera was held, as the file's flight data state it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AttitudePrior {
+    /// What the angles turn.
+    pub of: AttitudeOf,
+    /// Degrees clockwise from north; `None` when the file gives none.
+    pub yaw_deg: Option<f64>,
+    /// Degrees upwards.
+    pub pitch_deg: f64,
+    /// Degrees, right side down.
+    pub roll_deg: f64,
+}
+
+/// What a drone knows of its flight beside its position.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct FlightPrior {
+    /// Height in metres above where it took off, or above the ground where the file says so.
+    pub height_above_ground_m: Option<f64>,
+    /// How the camera was held.
+    pub attitude: Option<AttitudePrior>,
+}
+
 /// Where a camera's focal length comes from, best first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -70,6 +104,9 @@ pub struct ImageRecord {
     pub orientation: Orientation,
     /// Position, if the file has one.
     pub gps: Option<GpsPrior>,
+    /// Height above ground and attitude, if the file has any.
+    #[serde(default)]
+    pub flight: Option<FlightPrior>,
     /// Time of exposure in seconds of an unstated zone, for order only.
     pub captured_s: Option<f64>,
 }

@@ -18,7 +18,10 @@ mod submap;
 pub use error::SceneError;
 pub use features::{DESCRIPTOR_LEN, Features, Keypoint};
 pub use ids::{CameraId, ClusterId, ComponentId, ImageId, PointIndex};
-pub use image::{CameraRecord, FocalSource, GpsPrior, ImageRecord, ImageTable, Orientation, RejectedImage};
+pub use image::{
+    AttitudeOf, AttitudePrior, CameraRecord, FlightPrior, FocalSource, GpsPrior, ImageRecord, ImageTable,
+    Orientation, RejectedImage,
+};
 pub use model::Model;
 pub use pair::{ImagePair, MatchedPair, PairKind, PairSummary};
 pub use reconstruction::{Observation, Reconstruction, RegisteredImage, ScenePoint};

@@ -3,6 +3,7 @@
 use exif::{Exif, In, Tag, Value};
 use terrane_scene::GpsPrior;
 
+use super::xmp::Packet;
 use super::{field, number, number_at, text};
 
 /// Standard deviations in metres, horizontal per axis and vertical, of a consumer receiver's fix when the file gives
@@ -13,7 +14,7 @@ pub const DEFAULT_SIGMA_M: (f64, f64) = (5.0, 10.0);
 /// single-frequency receiver.
 const RANGE_ERROR_M: f64 = 3.0;
 
-pub(super) fn read(exif: &Exif, bytes: &[u8], notes: &mut Vec<String>) -> Option<GpsPrior> {
+pub(super) fn read(exif: &Exif, packet: &Packet, notes: &mut Vec<String>) -> Option<GpsPrior> {
     let latitude = &field(exif, Tag::GPSLatitude)?.value;
     let longitude = &field(exif, Tag::GPSLongitude)?.value;
     if text(exif, Tag::GPSStatus).is_some_and(|status| status.starts_with(['V', 'v'])) {
@@ -31,7 +32,7 @@ pub(super) fn read(exif: &Exif, bytes: &[u8], notes: &mut Vec<String>) -> Option
         notes.push("exif's gps position is 0, 0 (no fix); it was ignored".to_owned());
         return None;
     }
-    let (sigma_horizontal_m, sigma_vertical_m) = sigmas_m(exif, bytes);
+    let (sigma_horizontal_m, sigma_vertical_m) = sigmas_m(exif, packet);
     let altitude_m = altitude_m(exif);
     Some(GpsPrior { latitude_deg, longitude_deg, altitude_m, sigma_horizontal_m, sigma_vertical_m })
 }
@@ -63,11 +64,15 @@ fn altitude_m(exif: &Exif) -> Option<f64> {
 }
 
 /// From the receiver's own standard deviations, its stated error, its dilution of precision, or the default.
-fn sigmas_m(exif: &Exif, bytes: &[u8]) -> (f64, f64) {
+fn sigmas_m(exif: &Exif, packet: &Packet) -> (f64, f64) {
     let plausible = |sigma: &f64| (0.001..=1_000.0).contains(sigma);
-    let rtk = |axis: &str| xmp_number(bytes, &format!("drone-dji:RtkStd{axis}")).filter(plausible);
+    let rtk = |axis: &str| packet.number(&format!("drone-dji:RtkStd{axis}")).filter(plausible);
     if let (Some(lat), Some(lon), Some(height)) = (rtk("Lat"), rtk("Lon"), rtk("Hgt")) {
         return (lat.max(lon), height);
+    }
+    let accuracy = |axes: &str| packet.number(&format!("Camera:GPS{axes}Accuracy")).filter(plausible);
+    if let (Some(horizontal), Some(vertical)) = (accuracy("XY"), accuracy("Z")) {
+        return (horizontal, vertical);
     }
     if let Some(error) = number(exif, Tag::GPSHPositioningError).filter(plausible) {
         return (error, 2.0 * error);
@@ -76,19 +81,4 @@ fn sigmas_m(exif: &Exif, bytes: &[u8]) -> (f64, f64) {
         return (RANGE_ERROR_M * dilution, 2.0 * RANGE_ERROR_M * dilution);
     }
     DEFAULT_SIGMA_M
-}
-
-/// The number of an XMP property, written as an attribute (`name="1.5"`) or an element (`<name>1.5</name>`).
-fn xmp_number(bytes: &[u8], name: &str) -> Option<f64> {
-    // XMP stands in front of the pixels; a packet is at most 64 KiB, and a few segments may come before it.
-    let head = &bytes[..bytes.len().min(512 * 1024)];
-    let at = head.windows(name.len()).position(|window| window == name.as_bytes())? + name.len();
-    let tail = head.get(at..head.len().min(at + 64))?;
-    let number: Vec<u8> = tail
-        .iter()
-        .skip_while(|b| matches!(b, b'=' | b'"' | b'\'' | b'>' | b' '))
-        .take_while(|b| b.is_ascii_digit() || matches!(b, b'+' | b'-' | b'.' | b'e'))
-        .copied()
-        .collect();
-    std::str::from_utf8(&number).ok()?.parse::<f64>().ok().filter(|v| v.is_finite())
 }

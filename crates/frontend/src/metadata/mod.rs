@@ -1,16 +1,19 @@
-//! What a file says of its photograph: size, camera, lens, focal length, position, time.
+//! What a file says of its photograph: size, camera, lens, focal length, position, attitude, time.
 //!
 //! EXIF is a hint, never a condition: a file with broken metadata is used without them, and a note says so.
 
 mod gps;
 #[cfg(test)]
 mod tests;
+mod xmp;
+#[cfg(test)]
+mod xmp_tests;
 
 use std::io::Cursor;
 
 use exif::{Error, Exif, Field, In, Reader, Tag, Value};
 use serde::{Deserialize, Serialize};
-use terrane_scene::{GpsPrior, Orientation};
+use terrane_scene::{FlightPrior, GpsPrior, Orientation};
 
 use crate::{FrontendError, image};
 
@@ -39,6 +42,8 @@ pub struct ImageMetadata {
     pub focal_plane_px_per_mm: Option<f64>,
     /// Position from a satellite receiver.
     pub gps: Option<GpsPrior>,
+    /// Height above ground and attitude, from XMP.
+    pub flight: Option<FlightPrior>,
     /// Time of exposure in seconds since 1970 of the camera's own clock and zone: for order only.
     pub captured_s: Option<f64>,
     /// What of the metadata was broken or implausible and was left out.
@@ -53,11 +58,13 @@ pub fn read(bytes: &[u8]) -> Result<ImageMetadata, FrontendError> {
     let probe = image::probe(bytes)?;
     let mut metadata =
         ImageMetadata { width_px: probe.width, height_px: probe.height, ..ImageMetadata::default() };
+    let packet = xmp::Packet::find(bytes);
+    metadata.flight = packet.flight();
     if let Some(exif) = read_exif(bytes, &mut metadata.notes) {
         fill_camera(&exif, &mut metadata);
         fill_focal_plane(&exif, &mut metadata);
         metadata.captured_s = captured_s(&exif);
-        metadata.gps = gps::read(&exif, bytes, &mut metadata.notes);
+        metadata.gps = gps::read(&exif, &packet, &mut metadata.notes);
     }
     Ok(metadata)
 }

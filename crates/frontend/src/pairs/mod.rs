@@ -1,13 +1,19 @@
 //! Which photographs to match with which: few enough to afford, enough to hold the scene together.
 //!
-//! Near each other by GPS, near each other in the sequence, alike by their global descriptors, given as a list, or every
-//! pair there is. [`select`] combines them; [`blocks`] cuts the result into tasks that share images.
+//! Seeing the same ground or near each other by GPS, near each other in the sequence, alike in their looks, given as a
+//! list, or every pair there is. [`select`] combines them; [`blocks`] cuts the result into tasks that share images.
 
 mod blocks;
+mod footprint;
+#[cfg(test)]
+mod footprint_tests;
+mod overlap;
+mod places;
 mod sequence;
 mod spatial;
 #[cfg(test)]
 mod tests;
+mod views;
 
 use std::collections::BTreeMap;
 
@@ -16,7 +22,7 @@ use terrane_scene::{ImageId, ImagePair, ImageTable};
 
 pub use blocks::{BlockOptions, blocks};
 
-use crate::retrieval;
+use crate::retrieval::Similar;
 
 /// How pairs are chosen.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -27,11 +33,13 @@ pub enum PairMode {
     Auto,
     /// Every pair there is.
     Exhaustive,
-    /// Spatial neighbours; images without GPS by retrieval, or by sequence when there are no global descriptors.
+    /// Spatial neighbours; images without GPS by retrieval, or by sequence when retrieval is not to be had.
     Gps,
-    /// Neighbours in the sequence only.
+    /// Spatial neighbours and the most similar images, for every image: where positions are too coarse to trust alone.
+    GpsAndRetrieval,
+    /// Neighbours in the sequence, and loops that retrieval closes.
     Sequential,
-    /// The most similar by global descriptor only.
+    /// The most similar images only.
     Retrieval,
     /// [`PairOptions::list`] only.
     List,
@@ -51,9 +59,18 @@ pub struct PairOptions {
     /// Spatial neighbours farther than this many metres are left out; `None` leaves out those beyond four times the
     /// median over all images of the distance to their last neighbour. Default `None`.
     pub max_distance_m: Option<f64>,
+    /// Whether spatial neighbours are those that see the same ground, where height, field of view and attitude are known;
+    /// else they are the nearest. Default true.
+    pub footprints: bool,
+    /// Least part of the ground that either of two photographs sees that both must see, 0 to 1. Default 0.08: 15 % of each
+    /// of two equal ones, of which about as much is lost at borders as is left to match.
+    pub min_overlap: f64,
     /// Neighbours on each side in the sequence: by time of exposure within a folder where every image has one, else
     /// by path. Default 5 (with retrieval); 10 where the sequence is all there is (COLMAP).
     pub sequence_overlap: Option<u32>,
+    /// Similar images beyond its neighbours that each image of mode `sequential` is paired with, to close loops; 0 does
+    /// without. Default 5.
+    pub loop_closures: u32,
     /// Most similar images of an image. Default 30.
     pub retrieval_neighbours: u32,
     /// Pairs of paths as they stand in the image table, for mode `list`. Default empty.
@@ -67,7 +84,10 @@ impl Default for PairOptions {
             exhaustive_limit: 60,
             spatial_neighbours: 30,
             max_distance_m: None,
+            footprints: true,
+            min_overlap: 0.08,
             sequence_overlap: None,
+            loop_closures: 5,
             retrieval_neighbours: 30,
             list: Vec::new(),
         }
@@ -90,17 +110,23 @@ pub struct PairReport {
     pub from_exhaustive: u64,
     /// Pairs of spatial neighbours.
     pub from_gps: u64,
+    /// Pairs of images with overlapping footprints among them.
+    pub from_footprints: u64,
     /// Pairs of neighbours in the sequence.
     pub from_sequence: u64,
     /// Pairs of similar images.
     pub from_retrieval: u64,
+    /// Pairs of images far apart in the sequence that look alike.
+    pub from_loops: u64,
     /// Pairs of the list.
     pub from_list: u64,
     /// Images without a usable GPS position, when positions were used.
     pub without_gps: u32,
+    /// Images whose footprint on the ground was used.
+    pub with_footprint: u32,
     /// Distance in metres beyond which spatial neighbours were left out.
     pub max_distance_m: Option<f64>,
-    /// Retrieval was asked for and there were no global descriptors: the sequence was used instead.
+    /// Retrieval was asked for and was not to be had: the sequence was used instead.
     pub retrieval_missing: bool,
     /// Entries of the list that name no image, or one image twice.
     pub unusable_list_entries: Vec<[String; 2]>,
@@ -119,14 +145,19 @@ pub struct PairSelection {
 
 /// Chooses the pairs to match.
 ///
-/// `global` holds one descriptor an image, in the order of the table (empty for an image without features); `None` when
-/// there are none yet. See [`needs_global_descriptors`].
-pub fn select(table: &ImageTable, global: Option<&[Vec<f32>]>, options: &PairOptions) -> PairSelection {
-    let mut chosen = Chosen { table, options, global, pairs: Vec::new(), report: PairReport::default() };
+/// `similar` holds the most similar images of each image of the table, best first, at least for those that
+/// [`wanted_similar`] names; `None` when that is not to be had.
+pub fn select(table: &ImageTable, similar: Option<&[Vec<Similar>]>, options: &PairOptions) -> PairSelection {
+    let similar = similar.filter(|similar| similar.len() == table.images.len());
+    let mut chosen = Chosen { table, options, similar, pairs: Vec::new(), report: PairReport::default() };
     match resolve(table, options) {
         PairMode::Exhaustive => chosen.exhaustive(),
-        PairMode::Gps => chosen.gps(),
-        PairMode::Sequential => chosen.sequence(SEQUENCE_ALONE, |_| true),
+        PairMode::Gps => chosen.gps(|_| false),
+        PairMode::GpsAndRetrieval => chosen.gps(|_| true),
+        PairMode::Sequential => {
+            chosen.sequence(SEQUENCE_ALONE, |_| true);
+            chosen.loops();
+        }
         PairMode::List => chosen.list(),
         PairMode::Retrieval => chosen.retrieval(|_| true),
         PairMode::Auto => {
@@ -137,13 +168,18 @@ pub fn select(table: &ImageTable, global: Option<&[Vec<f32>]>, options: &PairOpt
     chosen.finish()
 }
 
-/// Whether [`select`] would use global descriptors with these options.
-pub fn needs_global_descriptors(table: &ImageTable, options: &PairOptions) -> bool {
-    match resolve(table, options) {
-        PairMode::Exhaustive | PairMode::Sequential | PairMode::List => false,
-        PairMode::Auto | PairMode::Retrieval => true,
-        PairMode::Gps => table.images.iter().any(|image| spatial::position_m(image).is_none()),
-    }
+/// For each image whether [`select`] would use its similar images with these options, and `None` when it needs nobody's.
+/// The similar images themselves may be any of the table.
+pub fn wanted_similar(table: &ImageTable, options: &PairOptions) -> Option<Vec<bool>> {
+    let wanted = match resolve(table, options) {
+        PairMode::Exhaustive | PairMode::List => return None,
+        PairMode::Sequential if options.loop_closures == 0 => return None,
+        PairMode::Gps => spatial::neighbours(table, options).alone,
+        PairMode::Auto | PairMode::Retrieval | PairMode::GpsAndRetrieval | PairMode::Sequential => {
+            vec![true; table.images.len()]
+        }
+    };
+    wanted.contains(&true).then_some(wanted)
 }
 
 /// `Auto` decided as far as the table decides it; what stays `Auto` is retrieval with sequence.
@@ -166,7 +202,7 @@ fn resolve(table: &ImageTable, options: &PairOptions) -> PairMode {
 struct Chosen<'a> {
     table: &'a ImageTable,
     options: &'a PairOptions,
-    global: Option<&'a [Vec<f32>]>,
+    similar: Option<&'a [Vec<Similar>]>,
     pairs: Vec<ImagePair>,
     report: PairReport,
 }
@@ -174,7 +210,11 @@ struct Chosen<'a> {
 impl Chosen<'_> {
     /// Adds pairs of positions in the table; returns how many different ones.
     fn add(&mut self, pairs: impl IntoIterator<Item = (usize, usize)>) -> u64 {
-        let as_ids = |(a, b)| ImagePair::new(ImageId::from_index(a), ImageId::from_index(b));
+        let num_images = self.table.images.len();
+        let as_ids = |(a, b): (usize, usize)| {
+            let is_known = a < num_images && b < num_images;
+            is_known.then(|| ImagePair::new(ImageId::from_index(a), ImageId::from_index(b))).flatten()
+        };
         let mut new: Vec<ImagePair> = pairs.into_iter().filter_map(as_ids).collect();
         new.sort_unstable();
         new.dedup();
@@ -188,32 +228,59 @@ impl Chosen<'_> {
         self.report.from_exhaustive = self.add(all);
     }
 
-    /// Spatial neighbours; images that have no position, or no neighbour within reach, are paired by other means.
-    fn gps(&mut self) {
+    /// Spatial neighbours. Images that have no position, or hardly a neighbour within reach, and those that `also` names,
+    /// are paired by looks as well.
+    fn gps(&mut self, also: impl Fn(usize) -> bool) {
         let found = spatial::neighbours(self.table, self.options);
         self.report.without_gps = found.without_position;
+        self.report.with_footprint = found.num_footprints;
         self.report.max_distance_m = found.max_distance_m;
+        self.report.from_footprints = self.add(found.by_footprint);
         self.report.from_gps = self.add(found.pairs);
         let alone = found.alone;
-        if alone.iter().any(|&alone| alone) {
-            self.retrieval(|image| alone[image]);
+        if (0..alone.len()).any(|image| alone[image] || also(image)) {
+            self.retrieval(|image| alone[image] || also(image));
             self.sequence(SEQUENCE_BESIDE_RETRIEVAL, |image| alone[image]);
         }
     }
 
     /// The most similar images of those that `wanted` names.
     fn retrieval(&mut self, wanted: impl Fn(usize) -> bool) {
-        let Some(global) = self.global.filter(|global| global.len() == self.table.images.len()) else {
+        let Some(similar) = self.similar else {
             self.report.retrieval_missing = true;
             self.sequence(SEQUENCE_ALONE, wanted);
             return;
         };
-        let similar = retrieval::nearest(global, self.options.retrieval_neighbours as usize);
-        let pairs =
-            similar.into_iter().enumerate().filter(|(image, _)| wanted(*image)).flat_map(|(image, list)| {
-                list.into_iter().map(move |neighbour| (image, neighbour.index as usize))
-            });
+        let count = self.options.retrieval_neighbours as usize;
+        let of_image = |image: usize| {
+            similar[image].iter().take(count).map(move |neighbour| (image, neighbour.index as usize))
+        };
+        let pairs: Vec<(usize, usize)> =
+            (0..similar.len()).filter(|&image| wanted(image)).flat_map(of_image).collect();
         self.report.from_retrieval = self.add(pairs);
+    }
+
+    /// The most similar images of each image that are not near it in the sequence.
+    fn loops(&mut self) {
+        if self.options.loop_closures == 0 {
+            return;
+        }
+        let Some(similar) = self.similar else {
+            self.report.retrieval_missing = true;
+            return;
+        };
+        let overlap = self.options.sequence_overlap.unwrap_or(SEQUENCE_ALONE) as usize;
+        let places = sequence::places(self.table);
+        let of_image = |image: usize| {
+            let is_far = |other: &usize| {
+                places.get(*other).is_some_and(|place| place.abs_diff(places[image]) > overlap)
+            };
+            let others = similar[image].iter().map(|neighbour| neighbour.index as usize);
+            let far = others.filter(is_far).take(self.options.loop_closures as usize);
+            far.map(|other| (image, other)).collect::<Vec<_>>()
+        };
+        let pairs: Vec<(usize, usize)> = (0..similar.len()).flat_map(of_image).collect();
+        self.report.from_loops = self.add(pairs);
     }
 
     /// Neighbours in the sequence of the images that `wanted` names.

@@ -14,6 +14,14 @@ pub(super) fn neighbours(table: &ImageTable, overlap: usize) -> Vec<(usize, usiz
     pairs
 }
 
+/// The place of each image of the table in the sequence.
+pub(super) fn places(table: &ImageTable) -> Vec<usize> {
+    let order = order(table);
+    let mut places = vec![0; order.len()];
+    order.into_iter().enumerate().for_each(|(place, image)| places[image] = place);
+    places
+}
+
 /// Folder by folder; within one by time when every image of it has one, else by path. Folders follow each other, so
 /// that a sequence that was cut into folders stays in one piece.
 fn order(table: &ImageTable) -> Vec<usize> {

@@ -21,6 +21,7 @@ fn image(path: &str, gps: Option<(f64, f64)>, captured_s: Option<f64>) -> ImageR
         height_px: 100,
         orientation: Orientation::default(),
         gps,
+        flight: None,
         captured_s,
     }
 }
@@ -39,7 +40,7 @@ fn plain(count: usize) -> ImageTable {
 }
 
 /// A square grid of positions, `spacing_m` apart, at 45 degrees north across the date line.
-fn grid(side: usize, spacing_m: f64) -> ImageTable {
+pub(super) fn grid(side: usize, spacing_m: f64) -> ImageTable {
     let (north_deg, east_deg) = (spacing_m / 111_132.0, spacing_m / 78_847.0);
     let place = |at: usize| {
         let (row, column) = (at / side, at % side);
@@ -50,11 +51,15 @@ fn grid(side: usize, spacing_m: f64) -> ImageTable {
     table((0..side * side).map(|at| image(&format!("{at:04}.jpg"), Some(place(at)), None)).collect())
 }
 
-fn options(mode: PairMode) -> PairOptions {
+pub(super) fn options(mode: PairMode) -> PairOptions {
     PairOptions { mode, ..PairOptions::default() }
 }
 
-fn as_numbers(pairs: &[ImagePair]) -> Vec<(u32, u32)> {
+fn similar(index: u32) -> Similar {
+    Similar { index, similarity: 0.5, votes: 0 }
+}
+
+pub(super) fn as_numbers(pairs: &[ImagePair]) -> Vec<(u32, u32)> {
     pairs.iter().map(|pair| (pair.first().0, pair.second().0)).collect()
 }
 
@@ -95,11 +100,12 @@ fn auto_uses_gps_and_pairs_images_without_it_by_other_means() {
     mixed.images[38].gps =
         Some(GpsPrior { latitude_deg: f64::NAN, ..mixed.images[0].gps.expect("set above") });
     mixed.images[39].gps = Some(GpsPrior { latitude_deg: 12.0, ..mixed.images[0].gps.expect("set above") });
-    assert!(needs_global_descriptors(&mixed, &PairOptions::default()));
-    assert!(!needs_global_descriptors(&grid(10, 20.0), &PairOptions::default()));
-    let mut global = vec![vec![0.0f32; 100]; 100];
-    (0..100).for_each(|at| global[at][at % 50] = 1.0);
-    let selection = select(&mixed, Some(&global), &PairOptions::default());
+    let wanted = wanted_similar(&mixed, &PairOptions::default()).expect("some need their looks");
+    let named: Vec<usize> = (0..100).filter(|&image| wanted[image]).collect();
+    assert_eq!(named, [37, 38, 39]);
+    assert!(wanted_similar(&grid(10, 20.0), &PairOptions::default()).is_none());
+    let looks: Vec<Vec<Similar>> = (0..100).map(|at| vec![similar((at + 50) % 100)]).collect();
+    let selection = select(&mixed, Some(&looks), &PairOptions::default());
     let pairs = as_numbers(&selection.pairs);
     assert_eq!(selection.report.without_gps, 2);
     assert!(pairs.contains(&(37, 87)), "the most similar image");
@@ -160,14 +166,46 @@ fn lists_name_paths_and_report_what_they_can_not_use() {
 
 #[test]
 fn retrieval_pairs_the_similar() {
-    let global: Vec<Vec<f32>> =
-        (0..8).map(|at| vec![f32::from(at % 2 == 0), f32::from(at % 2 == 1)]).collect();
+    let looks: Vec<Vec<Similar>> =
+        (0..8).map(|at| (1..4).map(|k| similar((at + 2 * k) % 8)).collect()).collect();
     let mut wanted = options(PairMode::Retrieval);
     wanted.retrieval_neighbours = 3;
-    let selection = select(&plain(8), Some(&global), &wanted);
+    let selection = select(&plain(8), Some(&looks), &wanted);
     assert_eq!(selection.pairs.len(), 12);
     assert!(selection.pairs.iter().all(|pair| (pair.first().0 + pair.second().0) % 2 == 0));
-    assert!(select(&plain(9), Some(&global), &wanted).report.retrieval_missing, "one descriptor is missing");
+    assert!(select(&plain(9), Some(&looks), &wanted).report.retrieval_missing, "one list is missing");
+    let strangers = vec![vec![similar(7), similar(8), similar(99)]; 8];
+    select(&plain(8), Some(&strangers), &wanted);
+}
+
+#[test]
+fn loops_are_closed_by_looks_beyond_the_sequence() {
+    let looks: Vec<Vec<Similar>> =
+        (0..40).map(|at| [(at + 1) % 40, (at + 20) % 40, (at + 19) % 40].map(similar).to_vec()).collect();
+    let mut wanted = options(PairMode::Sequential);
+    (wanted.sequence_overlap, wanted.loop_closures) = (Some(2), 1);
+    assert_eq!(wanted_similar(&plain(40), &wanted), Some(vec![true; 40]));
+    let selection = select(&plain(40), Some(&looks), &wanted);
+    let pairs = as_numbers(&selection.pairs);
+    assert_eq!(selection.report.from_sequence, 39 + 38);
+    // 0 and 39 are next to each other in looks and far apart in the sequence.
+    assert_eq!(selection.report.from_loops, 20 + 1);
+    assert!(pairs.contains(&(3, 23)) && pairs.contains(&(0, 39)) && !pairs.contains(&(3, 22)));
+    wanted.loop_closures = 0;
+    assert_eq!(wanted_similar(&plain(40), &wanted), None);
+    assert_eq!(select(&plain(40), None, &wanted).report.from_loops, 0);
+}
+
+#[test]
+fn gps_and_looks_are_combined_for_every_image() {
+    let table = grid(10, 20.0);
+    let looks: Vec<Vec<Similar>> = (0..100).map(|at| vec![similar(99 - at)]).collect();
+    let mut wanted = options(PairMode::GpsAndRetrieval);
+    wanted.spatial_neighbours = 4;
+    let selection = select(&table, Some(&looks), &wanted);
+    let pairs = as_numbers(&selection.pairs);
+    assert!(pairs.contains(&(0, 99)) && pairs.contains(&(0, 1)) && pairs.contains(&(0, 10)));
+    assert_eq!(selection.report.from_retrieval, 50);
 }
 
 #[test]

@@ -147,6 +147,7 @@ fn table(positions: &[Option<GpsPrior>]) -> ImageTable {
         height_px: 80,
         orientation: Orientation::default(),
         gps: *gps,
+        flight: None,
         captured_s: None,
     });
     let record = CameraRecord { camera, focal_source: FocalSource::Exif, name: String::new() };

@@ -82,6 +82,7 @@ fn table(
             height_px: metadata.height_px,
             orientation: metadata.orientation,
             gps: metadata.gps,
+            flight: metadata.flight,
             captured_s: metadata.captured_s,
         })
         .collect();

@@ -1,5 +1,6 @@
 //! Execution: one task in, one artefact out.
 
+mod appearance;
 mod components;
 mod graph;
 mod ingest;

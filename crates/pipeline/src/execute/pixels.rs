@@ -5,13 +5,13 @@ use std::collections::btree_map::Entry;
 
 use rayon::prelude::*;
 use terrane_frontend::verification::{Candidate, NotVerified, View, verify};
-use terrane_frontend::{image, matching, pairs, retrieval, sift};
+use terrane_frontend::{image, matching, pairs, sift};
 use terrane_geometry::Seed;
 use terrane_scene::codec::{self, FeatureBatchWriter, MatchBlock};
 use terrane_scene::{Features, ImageId, ImagePair, ImageTable, MatchedPair};
 
 use super::read::{self, PairsInfo};
-use super::{ExecutionContext, Made, encode_error};
+use super::{ExecutionContext, Made, appearance, encode_error};
 use crate::task::FeatureSet;
 use crate::{ArtefactKey, PipelineError, Stage, Store};
 
@@ -105,11 +105,11 @@ pub(super) fn pairs(
         }
     }
     info.rejected.sort();
-    let global = match pairs::needs_global_descriptors(&table, &options.select) {
-        true => Some(global_descriptors(store, context, features, table.images.len())?),
-        false => None,
+    let similar = match pairs::wanted_similar(&table, &options.select) {
+        Some(wanted) => Some(appearance::similar_images(store, context, features, &wanted)?),
+        None => None,
     };
-    let selection = pairs::select(&table, global.as_deref(), &options.select);
+    let selection = pairs::select(&table, similar.as_deref(), &options.select);
     let has_features = |image: ImageId| info.num_features[image.index()] > 0;
     let chosen: Vec<ImagePair> = selection
         .pairs
@@ -121,33 +121,6 @@ pub(super) fn pairs(
     let blocks = pairs::blocks(&chosen, &options.blocks);
     let counts = vec![("pairs", info.num_pairs), ("blocks", blocks.len() as u64)];
     Ok(Made { bytes: codec::encode_pair_blocks(&blocks, &info).map_err(encode_error)?, counts })
-}
-
-/// One global descriptor an image, from a vocabulary trained on the run. Batches are read twice, one at a time.
-fn global_descriptors(
-    store: &Store,
-    context: &ExecutionContext,
-    features: &FeatureSet,
-    num_images: usize,
-) -> Result<Vec<Vec<f32>>, PipelineError> {
-    let seed = context.config.stage_seed(Stage::Pairs);
-    let options = &context.config.pairs.vocabulary;
-    let per_image = (options.num_samples as usize).div_ceil(num_images.max(1));
-    let images: Vec<ImageId> = (0..num_images).map(ImageId::from_index).collect();
-    let mut sampled = Vec::new();
-    for image in &images {
-        context.cancel.check()?;
-        let found = read::features(store, features, *image)?;
-        sampled.extend(retrieval::sample(&found, per_image, seed.item(&[u64::from(image.0)])));
-    }
-    let vocabulary = retrieval::Vocabulary::train(&sampled, options, seed.derive("vocabulary"));
-    images
-        .par_iter()
-        .map(|image| {
-            context.cancel.check()?;
-            Ok(vocabulary.encode(&read::features(store, features, *image)?))
-        })
-        .collect()
 }
 
 pub(super) fn matching(
