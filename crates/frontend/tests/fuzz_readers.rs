@@ -21,9 +21,8 @@ fn hunt(specimens: &[Specimen], executions: u64, read: impl Fn(&[u8])) {
         if seed % 4 != 0 && bytes.starts_with(b"\x89PNG") {
             files::mend_png(&mut bytes);
         }
-        let (outcome, peak) = peak_bytes(|| {
-            std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| read(&bytes)))
-        });
+        let (outcome, peak) =
+            peak_bytes(|| std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| read(&bytes))));
         let name = &specimens[index].name;
         assert!(outcome.is_ok(), "seed {seed} of {name} panics");
         assert!(peak < MAX_BYTES, "seed {seed} of {name}, {} bytes, takes {peak} bytes", bytes.len());

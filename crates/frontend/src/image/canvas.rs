@@ -219,7 +219,8 @@ pub(super) fn split_ycbcr(mut data: Vec<u8>, width: usize, height: usize) -> Dec
     let mut colors = Vec::with_capacity(3 * width.div_ceil(2) * height.div_ceil(2));
     for top in (0..height).step_by(2) {
         let rows = (height - top).min(2);
-        let (upper, lower) = (&data[3 * width * top..][..3 * width], &data[3 * width * (top + rows - 1)..][..3 * width]);
+        let (upper, lower) =
+            (&data[3 * width * top..][..3 * width], &data[3 * width * (top + rows - 1)..][..3 * width]);
         // The last row of an odd height, and the last column of an odd width, count twice.
         for (a, b) in upper.chunks(6).zip(lower.chunks(6)) {
             let last = a.len() - 3;

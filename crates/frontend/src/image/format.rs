@@ -27,7 +27,7 @@ impl fmt::Display for Format {
 
 /// What a file of a format that is not read can become.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Remedy {
+pub(super) enum Remedy {
     /// A picture in another container.
     Convert,
     /// Sensor data: needs a raw converter.
@@ -56,7 +56,7 @@ impl Remedy {
 
 /// Formats that are recognised in order to say what to do, as (offset, magic, name, remedy).
 #[rustfmt::skip]
-const FOREIGN: &[(usize, &[u8], &str, Remedy)] = &[
+pub(super) const FOREIGN: &[(usize, &[u8], &str, Remedy)] = &[
     (8, b"CR\x02\0", "Canon raw (CR2)", Remedy::Develop),
     (6, b"HEAPCCDR", "Canon raw (CRW)", Remedy::Develop),
     (0, b"IIRO", "Olympus raw (ORF)", Remedy::Develop),
@@ -156,10 +156,13 @@ fn base_media(bytes: &[u8]) -> (&'static str, Remedy) {
     let major = bytes.get(8..12).unwrap_or_default();
     let compatible = bytes.get(16..end).unwrap_or_default();
     let named = |brand: &[u8]| major == brand || compatible.chunks_exact(4).any(|b| b == brand);
-    BRANDS.iter().find(|(brand, ..)| major == *brand).or_else(|| BRANDS.iter().find(|(b, ..)| named(b))).map_or(
-        ("video (MP4 and its relatives)", Remedy::ExtractFrames),
-        |(_, name, remedy)| (*name, *remedy),
-    )
+    BRANDS
+        .iter()
+        .find(|(brand, ..)| major == *brand)
+        .or_else(|| BRANDS.iter().find(|(b, ..)| named(b)))
+        .map_or(("video (MP4 and its relatives)", Remedy::ExtractFrames), |(_, name, remedy)| {
+            (*name, *remedy)
+        })
 }
 
 fn is_text(bytes: &[u8]) -> bool {

@@ -54,7 +54,10 @@ impl Frame {
         for (factors, [_, sampling, _]) in frame.sampling.iter_mut().zip(components) {
             *factors = (sampling >> 4, sampling & 15);
             if !matches!(*factors, (1 | 2 | 4, 1 | 2 | 4)) {
-                return Err(unsupported(&format!("JPEG with sampling factors {} x {}", factors.0, factors.1)));
+                return Err(unsupported(&format!(
+                    "JPEG with sampling factors {} x {}",
+                    factors.0, factors.1
+                )));
             }
         }
         Ok(frame)
@@ -172,7 +175,9 @@ pub(super) fn decode(
     let data = decoder.decode().map_err(broken)?;
     drop(decoder);
     if data.len() != width * height * out.num_components() {
-        return Err(FrontendError::corrupt(format!("the JPEG file holds another number of pixels: {REMEDY}")));
+        return Err(FrontendError::corrupt(format!(
+            "the JPEG file holds another number of pixels: {REMEDY}"
+        )));
     }
     match out {
         ColorSpace::Luma => Ok(DecodedImage { luma: GrayImage { width, height, data }, rgb: None }),

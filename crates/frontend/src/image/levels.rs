@@ -28,7 +28,8 @@ impl Levels {
 
     fn between(low: f32, high: f32, min_span: f32) -> Self {
         let span = (high - low).max(min_span);
-        let levels_per_unit = if span > 0.0 && span.is_finite() { (255.0 - 2.0 * MARGIN) / span } else { 0.0 };
+        let levels_per_unit =
+            if span > 0.0 && span.is_finite() { (255.0 - 2.0 * MARGIN) / span } else { 0.0 };
         Self { low, levels_per_unit }
     }
 }

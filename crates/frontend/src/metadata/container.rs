@@ -69,9 +69,7 @@ fn tiff_directories(bytes: &[u8]) -> Option<Vec<u8>> {
 /// Writes a directory at the end of a block and returns its offset. Pointers replace the entries of their tags.
 fn append(block: &mut Vec<u8>, order: Order, directory: &Directory<'_>, pointers: &[(u16, u32)]) -> u32 {
     let is_kept = |entry: &&Entry<'_>| {
-        entry.data.len() <= MAX_VALUE
-            && entry.kind <= 13
-            && ![EXIF_POINTER, GPS_POINTER].contains(&entry.tag)
+        entry.data.len() <= MAX_VALUE && entry.kind <= 13 && ![EXIF_POINTER, GPS_POINTER].contains(&entry.tag)
     };
     let room = MAX_BLOCK.saturating_sub(block.len());
     let mut kept: Vec<&Entry<'_>> = Vec::new();

@@ -13,11 +13,50 @@ const HEIGHT: usize = 13;
 /// Byte strings that mean something in the formats that are read, for mutations.
 pub fn words() -> &'static [&'static [u8]] {
     &[
-        b"\xff\xd8", b"\xff\xd9", b"\xff\xc0", b"\xff\xc2", b"\xff\xc4", b"\xff\xda", b"\xff\xdd\0\x04\0\x01", b"\xff\xd0",
-        b"\xff\xe1", b"\xff\xee\0\x0eAdobe\0\x64\0\0\0\0\0", b"\xff\xff", b"\xff\0", b"Exif\0\0", b"IHDR", b"IDAT", b"IEND",
-        b"PLTE", b"tRNS", b"eXIf", b"acTL", b"fdAT", b"II\x2a\0", b"MM\0\x2a", b"II\x2b\0", b"\0\x01", b"\x01\0",
-        b"http://ns.adobe.com/xap/1.0/\0", b"drone-dji:", b"RtkStdLat=\"", b"\"", b"<", b"/>", b"</", b"&amp;", b"1e400",
-        b"-", b"+", b".", b"NaN", b"\xef\xbb\xbf", b"\x87\x69\0\x04", b"\x69\x87\x04\0", b"\x88\x25\0\x04", b"\x25\x88\x04\0",
+        b"\xff\xd8",
+        b"\xff\xd9",
+        b"\xff\xc0",
+        b"\xff\xc2",
+        b"\xff\xc4",
+        b"\xff\xda",
+        b"\xff\xdd\0\x04\0\x01",
+        b"\xff\xd0",
+        b"\xff\xe1",
+        b"\xff\xee\0\x0eAdobe\0\x64\0\0\0\0\0",
+        b"\xff\xff",
+        b"\xff\0",
+        b"Exif\0\0",
+        b"IHDR",
+        b"IDAT",
+        b"IEND",
+        b"PLTE",
+        b"tRNS",
+        b"eXIf",
+        b"acTL",
+        b"fdAT",
+        b"II\x2a\0",
+        b"MM\0\x2a",
+        b"II\x2b\0",
+        b"\0\x01",
+        b"\x01\0",
+        b"http://ns.adobe.com/xap/1.0/\0",
+        b"drone-dji:",
+        b"RtkStdLat=\"",
+        b"\"",
+        b"<",
+        b"/>",
+        b"</",
+        b"&amp;",
+        b"1e400",
+        b"-",
+        b"+",
+        b".",
+        b"NaN",
+        b"\xef\xbb\xbf",
+        b"\x87\x69\0\x04",
+        b"\x69\x87\x04\0",
+        b"\x88\x25\0\x04",
+        b"\x25\x88\x04\0",
     ]
 }
 
@@ -132,7 +171,10 @@ fn tiffs() -> Vec<Specimen> {
         ("RGB", base(3, 8)),
         ("packed", TiffWriter { compression: Compression::PackBits, ..base(1, 8) }),
         ("LZW", TiffWriter { compression: Compression::Lzw, predictor: 2, ..base(3, 8) }),
-        ("Deflate", TiffWriter { compression: Compression::Deflate, predictor: 2, big_endian: true, ..base(1, 16) }),
+        (
+            "Deflate",
+            TiffWriter { compression: Compression::Deflate, predictor: 2, big_endian: true, ..base(1, 16) },
+        ),
         ("tiles", TiffWriter { tile: Some((16, 16)), compression: Compression::Deflate, ..base(3, 8) }),
         ("planes", TiffWriter { planar: true, big: true, ..base(3, 16) }),
         ("planes in tiles", TiffWriter { planar: true, tile: Some((16, 16)), ..base(3, 8) }),
@@ -177,16 +219,21 @@ pub fn exif_specimens() -> Vec<Specimen> {
             (34_665, 4, 1, vec![8, 0, 0, 0]),
             (34_853, 4, 1, vec![16, 0, 0, 0]),
         ];
-        let bytes = TiffWriter { big, extra, ..TiffWriter::new(WIDTH, HEIGHT, 1, 8) }
-            .write(&vec![7; WIDTH * HEIGHT]);
+        let bytes =
+            TiffWriter { big, extra, ..TiffWriter::new(WIDTH, HEIGHT, 1, 8) }.write(&vec![7; WIDTH * HEIGHT]);
         let len = bytes.len();
-        all.push(Specimen { name: format!("tiff with exif, big {big}"), bytes, hot: vec![len.saturating_sub(300)..len] });
+        all.push(Specimen {
+            name: format!("tiff with exif, big {big}"),
+            bytes,
+            hot: vec![len.saturating_sub(300)..len],
+        });
     }
     all
 }
 
 fn png_with_exif(block: &[u8], name: &str) -> Specimen {
-    let plain = pngs().into_iter().find(|specimen| specimen.name == "png grey").map(|s| s.bytes).unwrap_or_default();
+    let plain =
+        pngs().into_iter().find(|specimen| specimen.name == "png grey").map(|s| s.bytes).unwrap_or_default();
     let mut bytes = plain.get(..33).unwrap_or_default().to_vec();
     bytes.extend((block.len() as u32).to_be_bytes());
     bytes.extend(b"eXIf");
@@ -253,12 +300,19 @@ pub fn xmp_specimens() -> Vec<Specimen> {
         ("CalibratedFocalLength", "3666.666504"),
     ];
     let attributes: String = names.iter().map(|(n, v)| format!(" drone-dji:{n}=\"{v}\"")).collect();
-    let elements: String =
-        names.iter().map(|(n, v)| format!("<drone-dji:{n}>{v}</drone-dji:{n}>")).collect();
+    let elements: String = names.iter().map(|(n, v)| format!("<drone-dji:{n}>{v}</drone-dji:{n}>")).collect();
     let space = "xmlns:drone-dji=\"http://www.dji.com/drone-dji/1.0/\"";
     let packets = [
-        ("attributes", format!("<x:xmpmeta><rdf:RDF><rdf:Description {space}{attributes}/></rdf:RDF></x:xmpmeta>")),
-        ("elements", format!("<x:xmpmeta><rdf:RDF><rdf:Description {space}>{elements}</rdf:Description></rdf:RDF></x:xmpmeta>")),
+        (
+            "attributes",
+            format!("<x:xmpmeta><rdf:RDF><rdf:Description {space}{attributes}/></rdf:RDF></x:xmpmeta>"),
+        ),
+        (
+            "elements",
+            format!(
+                "<x:xmpmeta><rdf:RDF><rdf:Description {space}>{elements}</rdf:Description></rdf:RDF></x:xmpmeta>"
+            ),
+        ),
     ];
     let mut exif = b"Exif\0\0".to_vec();
     exif.extend(exif_block(true));

@@ -112,14 +112,19 @@ impl TiffWriter {
         for plane in 0..planes {
             for top in (0..self.height).step_by(chunk_height) {
                 for left in (0..self.width).step_by(chunk_width) {
-                    let bottom = if self.tile.is_some() { top + chunk_height } else { self.height.min(top + chunk_height) };
+                    let bottom = if self.tile.is_some() {
+                        top + chunk_height
+                    } else {
+                        self.height.min(top + chunk_height)
+                    };
                     let mut raw = Vec::new();
                     for y in top..bottom {
                         let channels = if self.planar { plane..plane + 1 } else { 0..self.samples };
                         // Tiles are padded by repeating the edge.
                         let row: Vec<u64> = (left..left + chunk_width)
                             .flat_map(|x| {
-                                let at = (y.min(self.height - 1) * self.width + x.min(self.width - 1)) * self.samples;
+                                let at = (y.min(self.height - 1) * self.width + x.min(self.width - 1))
+                                    * self.samples;
                                 channels.clone().map(move |channel| values[at + channel])
                             })
                             .collect();
@@ -210,7 +215,7 @@ impl TiffWriter {
         let (count, inline, size) = if self.big { (8, 8, 20) } else { (2, 4, 12) };
         self.push(out, entries.len() as u64, count);
         let mut behind = out.len() + entries.len() * size + inline;
-        let mut values = Vec::new();
+        let mut values: Vec<u8> = Vec::new();
         for (tag, kind, number, data) in &entries {
             self.push(out, u64::from(*tag), 2);
             self.push(out, u64::from(*kind), 2);
@@ -253,7 +258,9 @@ fn pack_bits(raw: &[u8]) -> Vec<u8> {
             out.extend([(257 - run) as u8, raw[at]]);
             at += run;
         } else {
-            let end = (at + 1..raw.len().min(at + 128)).find(|k| raw[*k] == raw[k - 1]).unwrap_or(raw.len().min(at + 128));
+            let end = (at + 1..raw.len().min(at + 128))
+                .find(|k| raw[*k] == raw[k - 1])
+                .unwrap_or(raw.len().min(at + 128));
             out.push((end - at - 1) as u8);
             out.extend(&raw[at..end]);
             at = end;

@@ -64,8 +64,9 @@ pub(super) struct Layout<'a> {
 impl<'a> Layout<'a> {
     pub fn read(bytes: &'a [u8]) -> Result<Self, FrontendError> {
         let (file, first) = File::open(bytes).ok_or_else(|| corrupt("has half a header"))?;
-        let directory =
-            file.directory(first).ok_or_else(|| corrupt("is truncated: its directory lies beyond its end"))?;
+        let directory = file
+            .directory(first)
+            .ok_or_else(|| corrupt("is truncated: its directory lies beyond its end"))?;
         refuse_raw(&file, &directory)?;
         let size = |tag| directory.unsigned(tag).filter(|v| (1..=u64::from(u32::MAX)).contains(v));
         let (Some(width), Some(height)) = (size(tag::IMAGE_WIDTH), size(tag::IMAGE_LENGTH)) else {
@@ -75,8 +76,9 @@ impl<'a> Layout<'a> {
         if directory.unsigned(tag::FILL_ORDER) == Some(2) {
             return Err(unsupported("bits in reversed order"));
         }
-        let photometric =
-            directory.unsigned(tag::PHOTOMETRIC).ok_or_else(|| corrupt("does not say what its samples mean"))?;
+        let photometric = directory
+            .unsigned(tag::PHOTOMETRIC)
+            .ok_or_else(|| corrupt("does not say what its samples mean"))?;
         let samples = directory.unsigned(tag::SAMPLES_PER_PIXEL).unwrap_or(1) as usize;
         if !(1..=MAX_SAMPLES).contains(&samples) {
             return Err(unsupported(&format!("{samples} samples a pixel")));
@@ -136,9 +138,7 @@ impl<'a> Layout<'a> {
         let used = self.offsets.iter().zip(&self.lengths).take(self.num_chunks());
         match used.clone().find(|(offset, length)| offset.saturating_add(**length) > num_bytes as u64) {
             Some(_) => Err(corrupt(&format!("is truncated: its pixels end beyond its {num_bytes} bytes"))),
-            None if used.clone().any(|(_, length)| *length == 0) => {
-                Err(corrupt("has empty strips or tiles"))
-            }
+            None if used.clone().any(|(_, length)| *length == 0) => Err(corrupt("has empty strips or tiles")),
             None => Ok(()),
         }
     }

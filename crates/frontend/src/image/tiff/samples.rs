@@ -41,7 +41,9 @@ pub(super) fn row_bytes(num_samples: usize, bits: usize) -> usize {
 /// order afterwards, or big-endian after the floating-point predictor.
 pub(super) fn undo_predictor(row: &mut [u8], stride: usize, encoding: &mut Encoding, scratch: &mut Vec<u8>) {
     match (encoding.predictor, encoding.bits) {
-        (Predictor::Horizontal, 8) => (stride..row.len()).for_each(|k| row[k] = row[k].wrapping_add(row[k - stride])),
+        (Predictor::Horizontal, 8) => {
+            (stride..row.len()).for_each(|k| row[k] = row[k].wrapping_add(row[k - stride]))
+        }
         (Predictor::Horizontal, 16) => undo_words::<2>(row, stride, |a, b| {
             let order = encoding.order;
             let sum = order.u16(a).wrapping_add(order.u16(b));
@@ -114,7 +116,9 @@ impl Unpack for f32 {
         let order = encoding.order;
         let start = out.len();
         match (encoding.bits, encoding.kind) {
-            (16, _) => out.extend(row.as_chunks::<2>().0.iter().take(count).map(|b| from_half(order.u16(*b)))),
+            (16, _) => {
+                out.extend(row.as_chunks::<2>().0.iter().take(count).map(|b| from_half(order.u16(*b))))
+            }
             (64, _) => {
                 let values = row.as_chunks::<8>().0.iter().take(count);
                 out.extend(values.map(|b| f64::from_bits(order.u64(*b)) as f32));
@@ -172,9 +176,13 @@ mod tests {
 
     #[test]
     fn half_floats_are_those_of_the_standard() {
-        for (half, value) in
-            [(0x3c00, 1.0), (0xc000, -2.0), (0x3555, 0.333_251_95), (0x0001, 5.960_464_5e-8), (0x7bff, 65504.0)]
-        {
+        for (half, value) in [
+            (0x3c00, 1.0),
+            (0xc000, -2.0),
+            (0x3555, 0.333_251_95),
+            (0x0001, 5.960_464_5e-8),
+            (0x7bff, 65504.0),
+        ] {
             assert_eq!(from_half(half), value);
         }
         assert!(from_half(0x7c00).is_infinite() && from_half(0x7c01).is_nan());
