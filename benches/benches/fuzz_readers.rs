@@ -27,6 +27,7 @@ const TARGETS: [&str; 3] = ["image", "exif", "xmp"];
 thread_local! {
     /// Panics of this thread, also those that the reader catches.
     static PANICS: Cell<u64> = const { Cell::new(0) };
+    static LAST_PANIC: Cell<String> = const { Cell::new(String::new()) };
 }
 
 struct Request {
@@ -87,7 +88,10 @@ struct Tally {
 
 fn main() -> anyhow::Result<()> {
     let request = Request::from_args()?;
-    std::panic::set_hook(Box::new(|_| PANICS.with(|panics| panics.set(panics.get() + 1))));
+    std::panic::set_hook(Box::new(|info| {
+        PANICS.with(|panics| panics.set(panics.get() + 1));
+        LAST_PANIC.with(|last| last.set(info.to_string().replace('\n', " ")));
+    }));
     let targets: Vec<&str> =
         TARGETS.into_iter().filter(|name| request.target.as_deref().is_none_or(|t| t == *name)).collect();
     let mut rows = Vec::new();
@@ -190,13 +194,13 @@ fn execute(target: &str, mutator: &Mutator<'_>, specimens: &[Specimen], seed: u6
             if panics > 0 {
                 tally.caught_panics += 1;
                 if tally.caught_panics <= 20 {
-                    println!("{target} {seed} ({name}): a library panicked, caught");
+                    println!("{target} {seed} ({name}): caught: {}", LAST_PANIC.with(Cell::take));
                 }
             }
         }
         Err(_) => {
             tally.findings += 1;
-            println!("{target} {seed} ({name}): PANIC");
+            println!("{target} {seed} ({name}): PANIC: {}", LAST_PANIC.with(Cell::take));
         }
     }
     if peak > MAX_BYTES {

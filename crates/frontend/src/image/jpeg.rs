@@ -24,6 +24,7 @@ pub(super) struct Frame {
     pub width: u32,
     pub height: u32,
     pub num_components: usize,
+    is_progressive: bool,
     /// Horizontal and vertical sampling factors of the components.
     sampling: [(u8, u8); 4],
 }
@@ -45,6 +46,7 @@ impl Frame {
             width: u32::from(u16::from_be_bytes([*w0, *w1])),
             height: u32::from(u16::from_be_bytes([*h0, *h1])),
             num_components,
+            is_progressive: marker == 0xc2,
             sampling: [(1, 1); 4],
         };
         let components = components.as_chunks::<3>().0;
@@ -60,7 +62,21 @@ impl Frame {
                 )));
             }
         }
+        // No camera does this, and the decoder gets it wrong.
+        let (across, down) = frame.sampling[0];
+        if frame.sampling[..num_components].iter().any(|(h, v)| *h > across || *v > down) {
+            return Err(unsupported("JPEG with its first component sampled more coarsely than another"));
+        }
         Ok(frame)
+    }
+
+    /// The decoder mixes up the components of a sequential file that come one after the other; cameras interleave them.
+    fn check_scan(&self, segment: &[u8]) -> Result<(), FrontendError> {
+        let num_components = segment.first().map_or(0, |count| usize::from(*count));
+        if !self.is_progressive && num_components != self.num_components {
+            return Err(unsupported("sequential JPEG with components in separate scans"));
+        }
+        Ok(())
     }
 
     /// The decoder's path to luma alone is right where no component is sampled more coarsely down than across.
@@ -122,7 +138,10 @@ pub(super) fn walk(bytes: &[u8]) -> Result<Frame, FrontendError> {
             }
             frame = Some(Frame::read(marker, segment)?);
         }
-        has_scan |= marker == START_OF_SCAN;
+        if let (START_OF_SCAN, Some(frame)) = (marker, frame) {
+            frame.check_scan(segment)?;
+            has_scan = true;
+        }
         at = payload + length;
     }
 }

@@ -23,9 +23,9 @@ pub(crate) use png::chunk as png_chunk;
 
 /// Bytes a pixel that [`decode`] needs at most besides the file itself, by any format.
 ///
-/// A baseline JPEG takes 3 (4 with inks), of which 1.75 are kept; PNG and TIFF are reduced row by row and take 1.75, or
-/// 3.5 of 16 bits and 7 of floating point; an interlaced PNG, and a TIFF in tiles or with JPEG inside, hold what they
-/// interleave besides. The most is a progressive JPEG without subsampling: 6 of coefficients and 3 of pixels.
+/// A baseline JPEG takes 3.75, of which 1.75 are kept; PNG and TIFF are reduced row by row and take 1.75, or 5.25 of 16
+/// bits and 8.75 of floating point; an interlaced PNG, and a TIFF in tiles or with JPEG inside, hold what they interleave
+/// besides. A progressive JPEG without subsampling takes 9: 6 of coefficients and 3 of pixels.
 pub const DECODING_BYTES_PER_PIXEL: u64 = 10;
 
 /// One channel of eight bits, row after row without padding.
@@ -51,11 +51,11 @@ pub struct RgbImage {
 }
 
 impl RgbImage {
-    /// The colour of a pixel of a grid `full_width` columns wide, of which this image may be a reduction; `None`
-    /// outside of it.
-    pub fn at_pixel(&self, column: usize, row: usize, full_width: usize) -> Option<[u8; 3]> {
-        let cell = full_width.div_ceil(self.width.max(1)).max(1);
-        let (column, row) = (column / cell, row / cell);
+    /// The colour of a pixel of a grid of `full` columns and rows, of which this image may be a reduction; `None` outside
+    /// of it.
+    pub fn at_pixel(&self, column: usize, row: usize, full: (usize, usize)) -> Option<[u8; 3]> {
+        let cell = |full: usize, len: usize| full.div_ceil(len.max(1)).max(1);
+        let (column, row) = (column / cell(full.0, self.width), row / cell(full.1, self.height));
         if column >= self.width {
             return None;
         }

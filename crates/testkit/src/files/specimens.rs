@@ -95,7 +95,6 @@ fn jpegs() -> Vec<Specimen> {
         sampled("4:2:2", SamplingFactor::F_2_1),
         sampled("4:2:0", SamplingFactor::F_2_2),
         sampled("4:4:0", SamplingFactor::F_1_2),
-        sampled("4:1:1", SamplingFactor::F_4_1),
         jpeg("restarts", ColorType::Rgb, |e| e.set_restart_interval(1)),
         jpeg("progressive", ColorType::Rgb, |e| {
             e.set_progressive(true);

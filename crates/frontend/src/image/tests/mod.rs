@@ -85,13 +85,19 @@ fn colors_are_looked_up_in_cells() {
     let image = open(&png(&picture(), ::png::ColorType::Rgb, ::png::BitDepth::Eight, None));
     let rgb = image.rgb.unwrap();
     assert_eq!((rgb.width, rgb.height), (19, 11));
-    assert_eq!(rgb.at_pixel(0, 0, 37), Some([3, 6, 128]));
-    assert_eq!(rgb.at_pixel(1, 1, 37), rgb.at_pixel(0, 0, 37));
-    assert_eq!(rgb.at_pixel(36, 20, 37), Some([36 * 6, 20 * 11, 128]));
-    assert_eq!((rgb.at_pixel(38, 0, 37), rgb.at_pixel(0, 22, 37)), (None, None));
+    assert_eq!(rgb.at_pixel(0, 0, SIZE), Some([3, 6, 128]));
+    assert_eq!(rgb.at_pixel(1, 1, SIZE), rgb.at_pixel(0, 0, SIZE));
+    assert_eq!(rgb.at_pixel(36, 20, SIZE), Some([36 * 6, 20 * 11, 128]));
+    assert_eq!((rgb.at_pixel(38, 0, SIZE), rgb.at_pixel(0, 22, SIZE)), (None, None));
+    // A column one pixel wide is still halved in height.
+    let narrow = RgbImage { width: 1, height: 2, data: vec![1, 2, 3, 4, 5, 6] };
+    assert_eq!(
+        (narrow.at_pixel(0, 1, (1, 3)), narrow.at_pixel(0, 2, (1, 3))),
+        (Some([1, 2, 3]), Some([4, 5, 6]))
+    );
     // An image that is not reduced is its own grid.
     let whole = RgbImage { width: 2, height: 1, data: vec![1, 2, 3, 4, 5, 6] };
-    assert_eq!((whole.at_pixel(1, 0, 2), whole.at_pixel(0, 1, 2)), (Some([4, 5, 6]), None));
+    assert_eq!((whole.at_pixel(1, 0, (2, 1)), whole.at_pixel(0, 1, (2, 1))), (Some([4, 5, 6]), None));
 }
 
 #[test]

@@ -87,10 +87,9 @@ fn narrow_ranges_of_16_bits_keep_their_contrast() {
         let data: Vec<u8> = values.iter().flat_map(|v| v.to_be_bytes()).collect();
         let luma = open(&png(&data, ColorType::Grayscale, BitDepth::Sixteen, None)).luma.data;
         let row = &luma[..width];
-        assert!(
-            row.is_sorted() && row[0] <= 20 && row[width - 1] >= if step == 3 { 115 } else { 235 },
-            "{row:?}"
-        );
+        // Never more than a level a unit.
+        let last = if step == 3 { 105..=120 } else { 235..=245 };
+        assert!(row[0] <= 20 && last.contains(&row[width - 1]), "{row:?}");
         assert!(row.windows(2).all(|pair| pair[1] > pair[0]), "{row:?}");
     }
     // A constant image stays calm.
