@@ -2,14 +2,13 @@
 //!
 //! EXIF is a hint, never a condition: a file with broken metadata is used without them, and a note says so.
 
+mod container;
 mod gps;
 #[cfg(test)]
 mod tests;
 mod xmp;
 #[cfg(test)]
 mod xmp_tests;
-
-use std::io::Cursor;
 
 use exif::{Error, Exif, Field, In, Reader, Tag, Value};
 use serde::{Deserialize, Serialize};
@@ -60,7 +59,7 @@ pub fn read(bytes: &[u8]) -> Result<ImageMetadata, FrontendError> {
         ImageMetadata { width_px: probe.width, height_px: probe.height, ..ImageMetadata::default() };
     let packet = xmp::Packet::find(bytes);
     metadata.flight = packet.flight();
-    if let Some(exif) = read_exif(bytes, &mut metadata.notes) {
+    if let Some(exif) = read_exif(bytes, probe.format, &mut metadata.notes) {
         fill_camera(&exif, &mut metadata);
         fill_focal_plane(&exif, &mut metadata);
         metadata.captured_s = captured_s(&exif);
@@ -69,11 +68,10 @@ pub fn read(bytes: &[u8]) -> Result<ImageMetadata, FrontendError> {
     Ok(metadata)
 }
 
-fn read_exif(bytes: &[u8], notes: &mut Vec<String>) -> Option<Exif> {
+fn read_exif(bytes: &[u8], format: image::Format, notes: &mut Vec<String>) -> Option<Exif> {
+    let block = container::exif_block(bytes, format)?;
     // A third party's reader on bytes from outside: a panic in it is a broken file.
-    let result = std::panic::catch_unwind(|| {
-        Reader::new().continue_on_error(true).read_from_container(&mut Cursor::new(bytes))
-    });
+    let result = std::panic::catch_unwind(|| Reader::new().continue_on_error(true).read_raw(block));
     let Ok(result) = result else {
         notes.push("exif can't be parsed and was ignored".to_owned());
         return None;

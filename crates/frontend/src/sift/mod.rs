@@ -165,6 +165,6 @@ fn orient(
 fn color_at(keypoint: &Keypoint, luma: &GrayImage, rgb: Option<&RgbImage>) -> [u8; 3] {
     let pixel = |at: f32, len: usize| (at.max(0.0) as usize).min(len.saturating_sub(1));
     let (x, y) = (pixel(keypoint.x_px, luma.width), pixel(keypoint.y_px, luma.height));
-    let of_rgb = rgb.and_then(|rgb| rgb.data.get(3 * (y * rgb.width + x)..)?.first_chunk::<3>().copied());
+    let of_rgb = rgb.and_then(|rgb| rgb.at_pixel(x, y, (luma.width, luma.height)));
     of_rgb.unwrap_or_else(|| [luma.data[y * luma.width + x]; 3])
 }

@@ -73,7 +73,10 @@ fn features_of(
         )));
     }
     let options = &context.config.features;
-    Ok(match image::decode(&bytes, &options.decode) {
+    let decoded = image::decode(&bytes, &options.decode);
+    // The file is not needed beside the scale space.
+    drop(bytes);
+    Ok(match decoded {
         Ok(decoded) => Ok(sift::extract(&decoded.luma, decoded.rgb.as_ref(), &options.sift)),
         Err(error) => Err(error.to_string()),
     })
