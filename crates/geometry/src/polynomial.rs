@@ -1,4 +1,4 @@
-//! Real roots of polynomials: closed forms up to degree three, Sturm's theorem above.
+//! Real roots of polynomials: in closed form up to degree two, by Newton's method at three, by Sturm's theorem above.
 //!
 //! Coefficients are given from the constant term up. Roots come in no particular order unless said; double roots may be
 //! reported once or, when rounding parts them from the real axis, not at all.
@@ -24,40 +24,62 @@ pub(crate) fn quadratic_roots(c: [f64; 3]) -> SmallVec<[f64; 3]> {
     roots
 }
 
-/// Real roots of `c[0] + c[1] x + c[2] x² + c[3] x³` (Viète's and Cardano's formulae), polished by Newton's method.
+/// Real roots of `c[0] + c[1] x + c[2] x² + c[3] x³`: the outermost by Newton's method from beyond it, where it can't
+/// overshoot (Deiters & Macías-Salinas 2014), the others of what is left. No transcendental functions, so that the bits are the
+/// same on any processor.
 pub(crate) fn cubic_roots(c: [f64; 4]) -> SmallVec<[f64; 3]> {
     let largest = c.iter().fold(0.0, |m: f64, value| m.max(value.abs()));
     if !(c[3].abs() > 1e-14 * largest) {
         return quadratic_roots([c[0], c[1], c[2]]);
     }
     let [c0, c1, c2] = [c[0] / c[3], c[1] / c[3], c[2] / c[3]];
-    let shift = -c2 / 3.0;
-    let q = (c2 * c2 - 3.0 * c1) / 9.0;
-    let r = (c2 * (2.0 * c2 * c2 - 9.0 * c1) + 27.0 * c0) / 54.0;
-    let mut roots = SmallVec::<[f64; 3]>::new();
-    if r * r < q * q * q {
-        let angle = (r / (q * q * q).sqrt()).clamp(-1.0, 1.0).acos();
-        for turn in 0..3 {
-            let third = (angle + std::f64::consts::TAU * f64::from(turn)) / 3.0;
-            roots.push(-2.0 * q.sqrt() * third.cos() + shift);
-        }
-    } else {
-        let a = -(r.abs() + (r * r - q * q * q).max(0.0).sqrt()).cbrt().copysign(r);
-        let b = if a == 0.0 { 0.0 } else { q / a };
-        roots.push(a + b + shift);
-    }
+    let newton = |x: f64| {
+        let value = c0 + x * (c1 + x * (c2 + x));
+        let slope = c1 + x * (2.0 * c2 + 3.0 * x);
+        let next = x - value / slope;
+        if next.is_finite() { next } else { x }
+    };
+    let outermost = outermost_root([c0, c1, c2], newton);
+    // Divided by `x - root` from the side that loses fewer digits.
+    let linear = c2 + outermost;
+    let constant = if outermost.abs() > 1.0 { -c0 / outermost } else { c1 + outermost * linear };
+    let mut roots = quadratic_roots([constant, linear, 1.0]);
     for root in &mut roots {
-        for _ in 0..2 {
-            let value = c0 + *root * (c1 + *root * (c2 + *root));
-            let slope = c1 + *root * (2.0 * c2 + 3.0 * *root);
-            let next = *root - value / slope;
-            if next.is_finite() {
-                *root = next;
-            }
-        }
+        *root = newton(newton(*root));
     }
+    roots.push(outermost);
     roots.retain(|root| root.is_finite());
     roots
+}
+
+/// The root of a monic cubic farthest from its point of inflection.
+fn outermost_root(c: [f64; 3], newton: impl Fn(f64) -> f64) -> f64 {
+    const MAX_STEPS: usize = 60;
+    let [c0, c1, c2] = c;
+    let inflection = -c2 / 3.0;
+    let at_inflection = c0 + inflection * (c1 + inflection * (c2 + inflection));
+    let discriminant = c2 * c2 - 3.0 * c1;
+    // With two extrema the root lies beyond the one on its side, at least here; with none, not beyond the cube root of the value.
+    let reach = match discriminant > 0.0 {
+        true => (2.0 / 3.0) * discriminant.sqrt(),
+        false => above_cube_root(at_inflection.abs()),
+    };
+    let mut x = inflection - reach.copysign(at_inflection);
+    for _ in 0..MAX_STEPS {
+        let next = newton(x);
+        let done = (next - x).abs() <= 1e-15 * (1.0 + x.abs());
+        x = next;
+        if done {
+            break;
+        }
+    }
+    x
+}
+
+/// A little more than the cube root of a positive number: a third of its exponent, by its bits.
+fn above_cube_root(value: f64) -> f64 {
+    const BIAS: u64 = 0x2a9f_7893_0000_0000;
+    if value > 0.0 && value.is_finite() { 1.1 * f64::from_bits(value.to_bits() / 3 + BIAS) } else { 0.0 }
 }
 
 /// Real roots of a polynomial of degree 10, isolated by Sturm's theorem (1829) and polished by safeguarded Newton steps.

@@ -82,7 +82,7 @@ impl Correspondences {
         }
         let in_border = |camera: &Camera, point: &Vector2<f64>| {
             let (width, height) = (f64::from(camera.width_px), f64::from(camera.height_px));
-            let margin = border * width.hypot(height);
+            let margin = border * (width * width + height * height).sqrt();
             point.x < margin || point.y < margin || point.x > width - margin || point.y > height - margin
         };
         let stays = (a_px - b_px).norm() <= self.threshold_px;
