@@ -17,13 +17,21 @@ import numpy as np
 import pycolmap
 
 
+MODELS = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"]
+
+
 def read_export(folder):
     cameras, keypoints = {}, {}
     for line in (folder / "cameras.txt").read_text().splitlines():
-        name, model, width, height, trusted, *params = line.rsplit(" ", 5 + NUM_PARAMS_OF(line))
-        cameras[name] = camera_of(model, int(width), int(height), [float(p) for p in params], trusted == "1")
+        # A name may hold spaces; models may not.
+        words = line.split(" ")
+        at = next(k for k, word in enumerate(words) if word in MODELS and k > 0)
+        name, (model, width, height, trusted, *params) = " ".join(words[:at]), words[at:]
+        camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=[float(p) for p in params])
+        camera.has_prior_focal_length = trusted == "1"
+        cameras[name] = camera
         text = (folder / f"{name}.keypoints").read_text()
-        keypoints[name] = np.fromstring(text, sep=" ").reshape(-1, 2)
+        keypoints[name] = np.array(text.split(), float).reshape(-1, 2)
     pairs = []
     for block in (folder / "matches.txt").read_text().strip().split("\n\n"):
         names, *rows = block.split("\n")
@@ -35,17 +43,6 @@ def read_export(folder):
         first, second, _, _, kind, milliseconds = line.split(" ")
         times[first, second] = (kind, float(milliseconds))
     return cameras, keypoints, pairs, times
-
-
-def NUM_PARAMS_OF(line):
-    models = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "FULL_OPENCV": 12}
-    return next(models[word] for word in line.split(" ") if word in models) - 1
-
-
-def camera_of(model, width, height, params, trusted):
-    camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
-    camera.has_prior_focal_length = trusted
-    return camera
 
 
 def verify(cameras, keypoints, pairs, repeats):

@@ -2,9 +2,9 @@
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector2, Vector3};
 use terrane_geometry::homography::squared_transfer_error;
-use terrane_geometry::ransac::RansacOptions;
-use terrane_geometry::two_view;
-use terrane_geometry::{Camera, Rigid3, Seed};
+use terrane_geometry::ransac::{self, RansacOptions};
+use terrane_geometry::two_view::{self, essential_from_pose};
+use terrane_geometry::{Rigid3, Seed};
 use terrane_scene::PairKind;
 
 use super::VerificationOptions;
@@ -19,6 +19,9 @@ const MAX_PLANAR_SAMPLED: usize = 300;
 
 /// With this share of the matches an essential matrix is settled, unless a fundamental matrix near it explains clearly more.
 const SETTLED_SHARE: f64 = 0.4;
+
+/// Trusted intrinsics are not given up for a fundamental matrix with less than this share of the matches.
+const MIN_FUNDAMENTAL_SHARE: f64 = 0.5;
 
 /// Sampling looks at no more than this many matches, evenly spread over their order of quality. Inliers are then taken from
 /// all of them.
@@ -99,40 +102,79 @@ fn planar(
     (agreeing.len() as f64 >= needed).then_some((homography, agreeing))
 }
 
-/// The better of essential and fundamental matrix. With trusted intrinsics the fundamental matrix must explain clearly more;
-/// guessed ones may be far off, so the one that explains more counts.
+/// The better of essential and fundamental matrix. With trusted intrinsics the fundamental matrix must explain clearly more, and
+/// most of the matches; guessed ones may be far off, so the one that explains more counts.
 fn epipolar(points: &Correspondences, options: &VerificationOptions, seed: Seed) -> Epipolar {
-    let sample = Subset::new(points, points.spread(MAX_SAMPLED_MATCHES));
-    let essential = sample.essential(points, options, seed);
-    let by_essential = essential.map(|e| points.within(&e)).unwrap_or_default();
-    let share = if points.is_calibrated { options.min_essential_share } else { 1.0 };
-    let is_settled = |fundamental_len: usize| by_essential.len() as f64 >= share * fundamental_len as f64;
-    let [to_first, to_second] = points.cameras.map(|camera| intrinsic_matrix(&camera));
-    let start =
-        essential.and_then(|e| Some(to_second.try_inverse()?.transpose() * e * to_first.try_inverse()?));
-    let fundamental = if points.is_calibrated && is_settled(points.len()) {
-        None
+    if points.is_calibrated {
+        by_trusted_cameras(points, options, seed)
     } else {
-        // Near an essential matrix that holds, no fundamental matrix explains clearly more; near one that does not, it does.
-        let is_likely = by_essential.len() as f64 >= SETTLED_SHARE * points.len() as f64;
-        let near = start.filter(|_| points.is_calibrated && is_likely);
-        match near.and_then(|near| sample.near_fundamental(points, &near)) {
-            Some(near) if is_settled(points.within_px(&near).len()) => Some(near),
-            _ => sample.fundamental(points, start.as_ref(), options, seed),
-        }
-    };
-    let fundamental_px = fundamental;
-    let by_fundamental = fundamental_px.map(|f| points.within_px(&f)).unwrap_or_default();
-    let fundamental = fundamental_px.map(|f| to_second.transpose() * f * to_first);
-    let is_essential = is_settled(by_fundamental.len());
-    let inliers = if is_essential { by_essential } else { by_fundamental };
-    Epipolar { essential, fundamental, fundamental_px, inliers, by_essential: is_essential }
+        by_guessed_cameras(points, options, seed)
+    }
 }
 
-/// The matrix that takes points of the plane z = 1 to pixels, without distortion.
-fn intrinsic_matrix(camera: &Camera) -> Matrix3<f64> {
-    let (focal, center) = (camera.focal_px(), camera.principal_point_px());
-    Matrix3::new(focal.x, 0.0, center.x, 0.0, focal.y, center.y, 0.0, 0.0, 1.0)
+fn by_trusted_cameras(points: &Correspondences, options: &VerificationOptions, seed: Seed) -> Epipolar {
+    let sample = Subset::new(points, points.spread(MAX_SAMPLED_MATCHES));
+    let essential = sample.essential(points, &options.ransac, seed);
+    let by_essential = essential.map(|e| points.within(&e)).unwrap_or_default();
+    let is_settled = |by_fundamental: &[u32]| {
+        by_essential.len() as f64 >= options.min_essential_share * by_fundamental.len() as f64
+    };
+    let start = essential.and_then(|e| points.in_pixels(&e));
+    // Near an essential matrix that holds, no fundamental matrix explains clearly more; near one that does not, it does.
+    let is_likely = by_essential.len() as f64 >= SETTLED_SHARE * points.len() as f64;
+    let near = start.filter(|_| is_likely).and_then(|start| sample.near_fundamental(points, &start));
+    let by_near = near.map(|f| points.within_px(&f)).unwrap_or_default();
+    if near.is_some() && is_settled(&by_near) {
+        return Epipolar::new(points, essential, near, by_essential, true);
+    }
+    // Seven points fit much by chance where little agrees.
+    let needed = MIN_FUNDAMENTAL_SHARE * points.len() as f64;
+    let enough = ransac::iterations_needed(MIN_FUNDAMENTAL_SHARE, 7, options.ransac.confidence);
+    let max_iterations = options.ransac.max_iterations.min(enough);
+    let ransac = RansacOptions { max_iterations, ..options.ransac };
+    let other = sample.fundamental(points, start.as_ref(), &ransac, seed);
+    let by_other = other.map(|f| points.within_px(&f)).unwrap_or_default();
+    if is_settled(&by_other) || (by_other.len() as f64) < needed {
+        return Epipolar::new(points, essential, near, by_essential, true);
+    }
+    Epipolar::new(points, essential, other, by_other, false)
+}
+
+fn by_guessed_cameras(points: &Correspondences, options: &VerificationOptions, seed: Seed) -> Epipolar {
+    let sample = Subset::new(points, points.spread(MAX_SAMPLED_MATCHES));
+    let fundamental = sample.fundamental(points, None, &options.ransac, seed);
+    let by_fundamental = fundamental.map(|f| points.within_px(&f)).unwrap_or_default();
+    // An essential matrix can't explain more than the best fundamental one: it need not be looked for any longer.
+    let share = by_fundamental.len() as f64 / points.len() as f64;
+    let enough = ransac::iterations_needed(share, 5, options.ransac.confidence);
+    let max_iterations = options.ransac.max_iterations.min(enough.max(options.ransac.min_iterations));
+    let ransac = RansacOptions { max_iterations, ..options.ransac };
+    let essential = sample.essential(points, &ransac, seed);
+    let by_essential = essential.map(|e| points.within(&e)).unwrap_or_default();
+    // Where seven points found little, five may have found where to look.
+    let start = essential.filter(|_| share < SETTLED_SHARE).and_then(|e| points.in_pixels(&e));
+    let other = start.and_then(|start| sample.near_fundamental(points, &start));
+    let by_other = other.map(|f| points.within_px(&f)).unwrap_or_default();
+    let (fundamental, by_fundamental) =
+        if by_other.len() > by_fundamental.len() { (other, by_other) } else { (fundamental, by_fundamental) };
+    if by_essential.len() >= by_fundamental.len() {
+        Epipolar::new(points, essential, fundamental, by_essential, true)
+    } else {
+        Epipolar::new(points, essential, fundamental, by_fundamental, false)
+    }
+}
+
+impl Epipolar {
+    fn new(
+        points: &Correspondences,
+        essential: Option<Matrix3<f64>>,
+        fundamental_px: Option<Matrix3<f64>>,
+        inliers: Vec<u32>,
+        by_essential: bool,
+    ) -> Self {
+        let fundamental = fundamental_px.map(|f| points.on_planes(&f));
+        Self { essential, fundamental, fundamental_px, inliers, by_essential }
+    }
 }
 
 /// Some of the correspondences as points of their own.
@@ -152,11 +194,11 @@ impl Subset {
     fn essential(
         &self,
         points: &Correspondences,
-        options: &VerificationOptions,
+        ransac: &RansacOptions,
         seed: Seed,
     ) -> Option<Matrix3<f64>> {
         let (limit, seed) = (points.threshold, seed.derive("essential"));
-        let found = two_view::estimate_essential(&self.first, &self.second, limit, &options.ransac, seed)?;
+        let found = two_view::estimate_essential(&self.first, &self.second, limit, ransac, seed)?;
         Some(found.model)
     }
 
@@ -176,11 +218,11 @@ impl Subset {
         &self,
         points: &Correspondences,
         start: Option<&Matrix3<f64>>,
-        options: &VerificationOptions,
+        ransac: &RansacOptions,
         seed: Seed,
     ) -> Option<Matrix3<f64>> {
         let [first, second] = self.in_pixels(points);
-        let (limit, ransac, seed) = (points.threshold_px, &options.ransac, seed.derive("fundamental"));
+        let (limit, seed) = (points.threshold_px, seed.derive("fundamental"));
         let found = two_view::estimate_fundamental_from(start, &first, &second, limit, ransac, seed)?;
         Some(found.model)
     }
@@ -236,7 +278,7 @@ fn with_pose(
     };
     let is_metric = points.is_calibrated && epipolar.by_essential;
     let (inliers, guide) = match is_metric {
-        true => (found.agreeing(points), Some(Guiding::Pose(found))),
+        true => (found.agreeing(points, epipolar.fundamental_px.as_ref()), Some(Guiding::Pose(found))),
         false => (epipolar.inliers, by_matrix),
     };
     let median_angle_rad = found.median_angle_rad(points, &inliers);
@@ -249,7 +291,10 @@ pub(super) fn with_more(points: &Correspondences, known: Geometry) -> Geometry {
     match known.guide {
         Some(Guiding::Pose(pose)) => {
             let pose = pose.refined_on(points, &all);
-            let inliers = pose.agreeing(points);
+            let sample = Subset::new(points, points.spread(MAX_SAMPLED_MATCHES));
+            let start = points.in_pixels(&essential_from_pose(&pose.second_from_first));
+            let near = start.and_then(|start| sample.near_fundamental(points, &start));
+            let inliers = pose.agreeing(points, near.as_ref());
             let median_angle_rad = pose.median_angle_rad(points, &inliers);
             let second_from_first = Some(pose.second_from_first);
             Geometry {

@@ -75,12 +75,22 @@ impl FoundPose {
     }
 
     /// Correspondences that agree with the pose at the focal lengths given, ascending.
-    pub(super) fn agreeing(&self, points: &Correspondences) -> Vec<u32> {
+    ///
+    /// With `near`, a fundamental matrix in pixels that was fitted from this pose, also those that agree with it: lenses bend
+    /// lines a little more than their models say, above all far from the centre.
+    pub(super) fn agreeing(&self, points: &Correspondences, near: Option<&Matrix3<f64>>) -> Vec<u32> {
         let pose = &self.second_from_first;
         let ahead = |&i: &u32| {
             !is_behind(pose, &points.first[i as usize], &points.second[i as usize], points.threshold)
         };
-        points.within(&essential_from_pose(pose)).into_iter().filter(ahead).collect()
+        let mut agreeing = points.within(&essential_from_pose(pose));
+        if let Some(near) = near {
+            agreeing.extend(points.within_px(near));
+            agreeing.sort_unstable();
+            agreeing.dedup();
+        }
+        agreeing.retain(ahead);
+        agreeing
     }
 
     /// Median angle of the rays of correspondences.

@@ -89,7 +89,8 @@ pub fn refine_relative_pose(
         indices.iter().copied().filter(|&i| (i as usize) < first.len().min(second.len())).collect();
     let data = Correspondences { first, second, indices: &in_range, loss_scale };
     let unit = Rigid3::new(start.rotation, direction);
-    small_lm::minimize(&PoseProblem(data), unit, &LmOptions::default()).0
+    let options = LmOptions { max_iterations: 12, cost_tolerance: 1e-7, ..LmOptions::default() };
+    small_lm::minimize(&PoseProblem(data), unit, &options).0
 }
 
 /// The angle, in radians, at which the rays of a correspondence on the plane z = 1 meet, given the rotation between views.
