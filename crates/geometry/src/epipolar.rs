@@ -1,9 +1,9 @@
 //! What essential and fundamental matrices share: Sampson's error, its refinement, and normalisation of points.
 
-use nalgebra::{Matrix3, SVector, Vector2, Vector3};
+use nalgebra::{Matrix3, Quaternion, SVector, UnitQuaternion, Vector2, Vector3};
 
 use crate::linear::{proper_svd3, tangent_basis};
-use crate::small_lm::{LeastSquares, NormalEquations, cauchy};
+use crate::small_lm::{LeastSquares, NormalEquations};
 use crate::{Rigid3, so3};
 
 /// Squared Sampson error (Sampson 1982) of a correspondence under `second ᵀ M first = 0`, in the points' squared unit.
@@ -64,18 +64,41 @@ impl Normalized {
         transform(self.scale, &self.second_mean)
     }
 
+    /// The first side's transform backwards.
+    pub(crate) fn first_inverse(&self) -> Matrix3<f64> {
+        inverse_transform(self.scale, &self.first_mean)
+    }
+
     /// The second side's transform backwards.
     pub(crate) fn second_inverse(&self) -> Matrix3<f64> {
-        let m = self.second_mean;
-        Matrix3::new(1.0 / self.scale, 0.0, m.x, 0.0, 1.0 / self.scale, m.y, 0.0, 0.0, 1.0)
+        inverse_transform(self.scale, &self.second_mean)
     }
+}
+
+fn inverse_transform(scale: f64, mean: &Vector2<f64>) -> Matrix3<f64> {
+    Matrix3::new(1.0 / scale, 0.0, mean.x, 0.0, 1.0 / scale, mean.y, 0.0, 0.0, 1.0)
 }
 
 fn transform(scale: f64, mean: &Vector2<f64>) -> Matrix3<f64> {
     Matrix3::new(scale, 0.0, -scale * mean.x, 0.0, scale, -scale * mean.y, 0.0, 0.0, 1.0)
 }
 
-/// Correspondences whose Sampson errors are minimised under a Cauchy loss.
+/// The loss `r² / (1 + r²/c²) / 2` (Geman & McClure 1987) of a squared residual, as (cost, weight of the residual).
+///
+/// Like the truncated error by which models are compared it levels off, so that outliers within the threshold pull little; and
+/// it takes no logarithm, whose bits would depend on the processor.
+#[inline]
+pub(crate) fn geman_mcclure(squared: f64, scale: f64) -> (f64, f64) {
+    let inverse = 1.0 / (1.0 + squared / (scale * scale));
+    (0.5 * squared * inverse, inverse * inverse)
+}
+
+/// The rotation `exp(ω)` to first order, exactly a rotation (Cayley 1846): for steps, without sine and cosine.
+fn small_turn(omega: &Vector3<f64>) -> UnitQuaternion<f64> {
+    UnitQuaternion::from_quaternion(Quaternion::from_parts(1.0, omega * 0.5))
+}
+
+/// Correspondences whose Sampson errors are minimised under the loss of Geman and McClure.
 pub(crate) struct Correspondences<'a> {
     pub(crate) first: &'a [Vector2<f64>],
     pub(crate) second: &'a [Vector2<f64>],
@@ -87,7 +110,7 @@ impl Correspondences<'_> {
     fn cost_of(&self, m: &Matrix3<f64>) -> f64 {
         let of_datum = |&i: &u32| {
             let squared = squared_sampson_error(m, &self.first[i as usize], &self.second[i as usize]);
-            cauchy(squared, self.loss_scale).0
+            geman_mcclure(squared, self.loss_scale).0
         };
         self.indices.iter().map(of_datum).sum()
     }
@@ -116,7 +139,7 @@ impl Correspondences<'_> {
             let right = ratio * Vector3::new(b.x, b.y, 0.0);
             let d_residual = (left * first.transpose() - second * right.transpose()) * inverse;
             let row: [f64; N] = std::array::from_fn(|k| d_residual.dot(&d_m[k]));
-            into.add(cauchy(residual * residual, self.loss_scale).1, residual, &row);
+            into.add(geman_mcclure(residual * residual, self.loss_scale).1, residual, &row);
         }
     }
 }
@@ -153,7 +176,7 @@ impl LeastSquares<5> for PoseProblem<'_> {
 
     fn retract(&self, pose: &Rigid3, step: &SVector<f64, 5>) -> Rigid3 {
         let (u, v) = tangent_basis(&pose.translation);
-        let mut rotation = so3::exp(&step.fixed_rows::<3>(0).into_owned()) * pose.rotation;
+        let mut rotation = small_turn(&step.fixed_rows::<3>(0).into_owned()) * pose.rotation;
         rotation.renormalize();
         Rigid3::new(rotation, (pose.translation + u * step[3] + v * step[4]).normalize())
     }
@@ -208,7 +231,7 @@ impl LeastSquares<7> for RankTwoProblem<'_> {
     fn retract(&self, state: &RankTwo, step: &SVector<f64, 7>) -> RankTwo {
         let turn = |start: usize| {
             let omega = Vector3::new(step[start], step[start + 1], step[start + 2]);
-            so3::exp(&omega).to_rotation_matrix().into_inner()
+            small_turn(&omega).to_rotation_matrix().into_inner()
         };
         RankTwo { u: state.u * turn(0), v: state.v * turn(3), sigma: state.sigma + step[6] }
     }

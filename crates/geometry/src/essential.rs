@@ -240,8 +240,9 @@ fn other_unknowns(b: &InZ, z: f64) -> Option<(f64, f64)> {
 /// The matrix at these coordinates of the null space, after Gauss–Newton steps on the cubic constraints: roots of the
 /// polynomial lose digits where two of them are close, as on planes.
 fn polished(basis: &SMatrix<f64, 9, 4>, mut coordinates: Vector4<f64>) -> Matrix3<f64> {
-    const MAX_STEPS: usize = 4;
-    const EXACT: f64 = 1e-13;
+    const MAX_STEPS: usize = 3;
+    /// Of a matrix of norm one; far below what noise leaves of five points.
+    const EXACT: f64 = 1e-10;
     let directions: [Matrix3<f64>; 4] =
         std::array::from_fn(|k| Matrix3::from_row_iterator(basis.column(k).iter().copied()));
     let combine = |c: &Vector4<f64>| {

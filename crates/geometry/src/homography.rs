@@ -4,9 +4,9 @@ use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
 use smallvec::SmallVec;
 
 use crate::Rigid3;
-use crate::epipolar::Normalized;
+use crate::epipolar::{Normalized, geman_mcclure};
 use crate::linear::symmetric_eigen;
-use crate::small_lm::{LeastSquares, NormalEquations, cauchy};
+use crate::small_lm::{LeastSquares, NormalEquations};
 
 /// Three points whose triangle has twice this area or less, for points of size one, count as collinear.
 const MIN_DOUBLE_AREA: f64 = 1e-7;
@@ -91,7 +91,7 @@ impl LeastSquares<8> for TransferProblem<'_> {
 
     fn cost(&self, h: &Matrix3<f64>) -> f64 {
         let of_datum = |&i: &u32| {
-            cauchy(
+            geman_mcclure(
                 squared_transfer_error(h, &self.first[i as usize], &self.second[i as usize]),
                 self.loss_scale,
             )
@@ -107,7 +107,7 @@ impl LeastSquares<8> for TransferProblem<'_> {
             let inverse = 1.0 / mapped.z;
             let transferred = mapped.xy() * inverse;
             let residual = transferred - self.second[i as usize];
-            let weight = cauchy(residual.norm_squared(), self.loss_scale).1;
+            let weight = geman_mcclure(residual.norm_squared(), self.loss_scale).1;
             for axis in 0..2 {
                 let mut full = [0.0; 9];
                 for k in 0..3 {

@@ -6,6 +6,7 @@
 pub mod absolute_pose;
 pub mod alignment;
 pub mod camera;
+mod elementary;
 mod epipolar;
 pub mod essential;
 pub mod fundamental;

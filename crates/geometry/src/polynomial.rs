@@ -1,4 +1,4 @@
-//! Real roots of polynomials: closed forms up to degree three, Sturm's theorem above.
+//! Real roots of polynomials: in closed form up to degree two, by Newton's method at three, by Sturm's theorem above.
 //!
 //! Coefficients are given from the constant term up. Roots come in no particular order unless said; double roots may be
 //! reported once or, when rounding parts them from the real axis, not at all.
@@ -24,135 +24,173 @@ pub(crate) fn quadratic_roots(c: [f64; 3]) -> SmallVec<[f64; 3]> {
     roots
 }
 
-/// Real roots of `c[0] + c[1] x + c[2] x² + c[3] x³` (Viète's and Cardano's formulae), polished by Newton's method.
+/// Real roots of `c[0] + c[1] x + c[2] x² + c[3] x³`: the outermost by Newton's method from beyond it, where it can't
+/// overshoot (Deiters & Macías-Salinas 2014), the others of what is left. No transcendental functions, so that the bits are the
+/// same on any processor.
 pub(crate) fn cubic_roots(c: [f64; 4]) -> SmallVec<[f64; 3]> {
     let largest = c.iter().fold(0.0, |m: f64, value| m.max(value.abs()));
     if !(c[3].abs() > 1e-14 * largest) {
         return quadratic_roots([c[0], c[1], c[2]]);
     }
     let [c0, c1, c2] = [c[0] / c[3], c[1] / c[3], c[2] / c[3]];
-    let shift = -c2 / 3.0;
-    let q = (c2 * c2 - 3.0 * c1) / 9.0;
-    let r = (c2 * (2.0 * c2 * c2 - 9.0 * c1) + 27.0 * c0) / 54.0;
-    let mut roots = SmallVec::<[f64; 3]>::new();
-    if r * r < q * q * q {
-        let angle = (r / (q * q * q).sqrt()).clamp(-1.0, 1.0).acos();
-        for turn in 0..3 {
-            let third = (angle + std::f64::consts::TAU * f64::from(turn)) / 3.0;
-            roots.push(-2.0 * q.sqrt() * third.cos() + shift);
-        }
-    } else {
-        let a = -(r.abs() + (r * r - q * q * q).max(0.0).sqrt()).cbrt().copysign(r);
-        let b = if a == 0.0 { 0.0 } else { q / a };
-        roots.push(a + b + shift);
-    }
+    let newton = |x: f64| {
+        let value = c0 + x * (c1 + x * (c2 + x));
+        let slope = c1 + x * (2.0 * c2 + 3.0 * x);
+        let next = x - value / slope;
+        if next.is_finite() { next } else { x }
+    };
+    let outermost = outermost_root([c0, c1, c2], newton);
+    // Divided by `x - root` from the side that loses fewer digits.
+    let linear = c2 + outermost;
+    let constant = if outermost.abs() > 1.0 { -c0 / outermost } else { c1 + outermost * linear };
+    let mut roots = quadratic_roots([constant, linear, 1.0]);
     for root in &mut roots {
-        for _ in 0..2 {
-            let value = c0 + *root * (c1 + *root * (c2 + *root));
-            let slope = c1 + *root * (2.0 * c2 + 3.0 * *root);
-            let next = *root - value / slope;
-            if next.is_finite() {
-                *root = next;
-            }
-        }
+        *root = newton(newton(*root));
     }
+    roots.push(outermost);
     roots.retain(|root| root.is_finite());
     roots
+}
+
+/// The root of a monic cubic farthest from its point of inflection.
+fn outermost_root(c: [f64; 3], newton: impl Fn(f64) -> f64) -> f64 {
+    const MAX_STEPS: usize = 60;
+    let [c0, c1, c2] = c;
+    let inflection = -c2 / 3.0;
+    let at_inflection = c0 + inflection * (c1 + inflection * (c2 + inflection));
+    let discriminant = c2 * c2 - 3.0 * c1;
+    // With two extrema the root lies beyond the one on its side, at least here; with none, not beyond the cube root of the value.
+    let reach = match discriminant > 0.0 {
+        true => (2.0 / 3.0) * discriminant.sqrt(),
+        false => above_cube_root(at_inflection.abs()),
+    };
+    let mut x = inflection - reach.copysign(at_inflection);
+    for _ in 0..MAX_STEPS {
+        let next = newton(x);
+        let done = (next - x).abs() <= 1e-15 * (1.0 + x.abs());
+        x = next;
+        if done {
+            break;
+        }
+    }
+    x
+}
+
+/// A little more than the cube root of a positive number: a third of its exponent, by its bits.
+fn above_cube_root(value: f64) -> f64 {
+    const BIAS: u64 = 0x2a9f_7893_0000_0000;
+    if value > 0.0 && value.is_finite() { 1.1 * f64::from_bits(value.to_bits() / 3 + BIAS) } else { 0.0 }
 }
 
 /// Real roots of a polynomial of degree 10, isolated by Sturm's theorem (1829) and polished by safeguarded Newton steps.
 ///
 /// Roots outside [-1, 1] are found as inverses of those of the reversed polynomial, so that all work is well scaled.
 pub(crate) fn degree_ten_roots(c: &[f64; 11]) -> SmallVec<[f64; 10]> {
+    /// Inverse of the largest root that is looked for.
+    const TINY: f64 = 1e-12;
     let mut roots = SmallVec::new();
     let largest = c.iter().fold(0.0, |m: f64, value| m.max(value.abs()));
     if !(largest > 0.0 && largest.is_finite()) {
         return roots;
     }
-    let scaled = c.map(|value| value / largest);
-    roots_in_unit_interval(&scaled, &mut roots);
-    let mut reversed = scaled;
-    reversed.reverse();
+    let inside = c.map(|value| value / largest);
+    let mut outside = inside;
+    outside.reverse();
+    let chain = SturmChain::new(&inside);
+    let at = |x: f64| chain.sign_changes(x);
+    let (below, above) = (at(-1.0), at(1.0));
+    isolate(&inside, &at, (-1.0, below), (1.0, above), &mut roots);
+    // In w = 1 / x the count falls where it grows in x.
+    let at_inverse = |w: f64| MEMBERS - chain.sign_changes(1.0 / w);
     let mut inverse = SmallVec::<[f64; 10]>::new();
-    roots_in_unit_interval(&reversed, &mut inverse);
+    let (lowest, highest) = (chain.sign_changes_at_infinity(-1.0), chain.sign_changes_at_infinity(1.0));
+    isolate(&outside, &at_inverse, (-1.0, MEMBERS - below), (-TINY, MEMBERS - lowest), &mut inverse);
+    isolate(&outside, &at_inverse, (TINY, MEMBERS - highest), (1.0, MEMBERS - above), &mut inverse);
     roots.extend(inverse.into_iter().filter(|w| w.abs() < 1.0 && *w != 0.0).map(|w| 1.0 / w));
     roots.retain(|root| root.is_finite());
     roots
 }
 
-fn roots_in_unit_interval(c: &[f64; 11], roots: &mut SmallVec<[f64; 10]>) {
-    let chain = SturmChain::new(c);
-    let (low, high) = (-1.0, 1.0);
-    chain.isolate(c, (low, chain.sign_changes(low)), (high, chain.sign_changes(high)), roots);
+/// Bisects until each part holds one root of `c`, then polishes it; ends come with their sign changes.
+fn isolate(
+    c: &[f64; 11],
+    sign_changes: &impl Fn(f64) -> usize,
+    low: (f64, usize),
+    high: (f64, usize),
+    roots: &mut SmallVec<[f64; 10]>,
+) {
+    let count = low.1.saturating_sub(high.1);
+    if count == 0 {
+        return;
+    }
+    if count == 1 || high.0 - low.0 < 1e-12 {
+        if let Some(root) = polish(c, low.0, high.0) {
+            roots.push(root);
+        }
+        return;
+    }
+    let middle = 0.5 * (low.0 + high.0);
+    let middle = (middle, sign_changes(middle));
+    isolate(c, sign_changes, low, middle, roots);
+    isolate(c, sign_changes, middle, high, roots);
 }
 
-/// Sturm's chain as quotients: `p[i+1] = (a x + b) p[i] - p[i+2]` evaluated downwards from the last two.
+/// Members of a chain: that of degree ten, its derivative, and remainders.
+const MEMBERS: usize = 11;
+/// Members that are evaluated together, with empty ones.
+const LANES: usize = 12;
+
+/// Sturm's chain of a polynomial.
 struct SturmChain {
-    members: [[f64; 11]; 11],
-    degrees: [usize; 11],
+    /// By power, then by member, so that all members are evaluated side by side.
+    coefficients: [[f64; LANES]; 11],
+    degrees: [usize; MEMBERS],
     len: usize,
 }
 
 impl SturmChain {
     fn new(c: &[f64; 11]) -> Self {
-        let mut chain = Self { members: [[0.0; 11]; 11], degrees: [0; 11], len: 0 };
+        let mut members = [[0.0; 11]; MEMBERS];
+        let mut degrees = [0; MEMBERS];
         let mut degree = 10;
         while degree > 0 && c[degree].abs() < 1e-15 {
             degree -= 1;
         }
-        chain.push(*c, degree);
-        if degree == 0 {
-            return chain;
+        (members[0], degrees[0]) = (scaled(*c, degree), degree);
+        let mut len = 1;
+        if degree > 0 {
+            let derivative =
+                std::array::from_fn(|i| if i < degree { c[i + 1] * (i + 1) as f64 } else { 0.0 });
+            (members[1], degrees[1]) = (scaled(derivative, degree - 1), degree - 1);
+            len = 2;
         }
-        let mut derivative = [0.0; 11];
-        for i in 1..=degree {
-            derivative[i - 1] = c[i] * i as f64;
-        }
-        chain.push(derivative, degree - 1);
-        while chain.degrees[chain.len - 1] > 0 {
-            let (remainder, degree) = chain.negated_remainder();
+        while len < MEMBERS && degrees[len - 1] > 0 {
+            let (remainder, degree) =
+                negated_remainder(&members[len - 2], degrees[len - 2], &members[len - 1], degrees[len - 1]);
             if remainder[..=degree].iter().all(|value| value.abs() < 1e-15) {
                 break;
             }
-            chain.push(remainder, degree);
+            (members[len], degrees[len]) = (scaled(remainder, degree), degree);
+            len += 1;
         }
-        chain
-    }
-
-    /// Adds a member, scaled to largest coefficient one (a positive factor keeps all signs).
-    fn push(&mut self, mut member: [f64; 11], degree: usize) {
-        let largest = member[..=degree].iter().fold(0.0, |m: f64, value| m.max(value.abs()));
-        if largest > 0.0 {
-            member.iter_mut().for_each(|value| *value /= largest);
-        }
-        self.members[self.len] = member;
-        self.degrees[self.len] = degree;
-        self.len += 1;
-    }
-
-    /// Minus the remainder of the last but one member by the last, scaled, with its degree.
-    fn negated_remainder(&self) -> ([f64; 11], usize) {
-        let (divisor, divisor_degree) = (&self.members[self.len - 1], self.degrees[self.len - 1]);
-        let mut rest = self.members[self.len - 2];
-        for top in (divisor_degree..=self.degrees[self.len - 2]).rev() {
-            let factor = rest[top] / divisor[divisor_degree];
-            for i in 0..=divisor_degree {
-                rest[top - divisor_degree + i] -= factor * divisor[i];
+        let mut coefficients = [[0.0; LANES]; 11];
+        for (lane, (member, degree)) in members.iter().zip(degrees).enumerate().take(len) {
+            for power in 0..=degree {
+                coefficients[power][lane] = member[power];
             }
-            rest[top] = 0.0;
         }
-        let mut degree = divisor_degree.saturating_sub(1);
-        let largest = rest[..=degree].iter().fold(0.0, |m: f64, value| m.max(value.abs()));
-        while degree > 0 && rest[degree].abs() < 1e-13 * largest {
-            degree -= 1;
-        }
-        (rest.map(|value| -value), degree)
+        Self { coefficients, degrees, len }
     }
 
     fn sign_changes(&self, x: f64) -> usize {
+        let mut values = [0.0; LANES];
+        for row in self.coefficients.iter().rev() {
+            for lane in 0..LANES {
+                values[lane] = values[lane] * x + row[lane];
+            }
+        }
         let (mut changes, mut last) = (0, 0.0);
-        for i in 0..self.len {
-            let value = evaluate(&self.members[i][..=self.degrees[i]], x);
+        for &value in &values[..self.len] {
             if value != 0.0 {
                 changes += usize::from(value * last < 0.0);
                 last = value.signum();
@@ -161,23 +199,51 @@ impl SturmChain {
         changes
     }
 
-    /// Bisects until each part holds one root, then polishes it.
-    fn isolate(&self, c: &[f64; 11], low: (f64, usize), high: (f64, usize), roots: &mut SmallVec<[f64; 10]>) {
-        let count = low.1.saturating_sub(high.1);
-        if count == 0 {
-            return;
-        }
-        if count == 1 || high.0 - low.0 < 1e-12 {
-            if let Some(root) = polish(c, low.0, high.0) {
-                roots.push(root);
+    /// Of the leading terms as `sign` times infinity is approached.
+    fn sign_changes_at_infinity(&self, sign: f64) -> usize {
+        let (mut changes, mut last) = (0, 0.0);
+        for lane in 0..self.len {
+            let degree = self.degrees[lane];
+            let odd = if degree % 2 == 1 { sign } else { 1.0 };
+            let value = self.coefficients[degree][lane] * odd;
+            if value != 0.0 {
+                changes += usize::from(value * last < 0.0);
+                last = value.signum();
             }
-            return;
         }
-        let middle = 0.5 * (low.0 + high.0);
-        let middle = (middle, self.sign_changes(middle));
-        self.isolate(c, low, middle, roots);
-        self.isolate(c, middle, high, roots);
+        changes
     }
+}
+
+/// Scaled to largest coefficient one (a positive factor keeps all signs).
+fn scaled(member: [f64; 11], degree: usize) -> [f64; 11] {
+    let largest = member[..=degree].iter().fold(0.0, |m: f64, value| m.max(value.abs()));
+    let factor = 1.0 / largest;
+    if largest > 0.0 && factor.is_finite() { member.map(|value| value * factor) } else { member }
+}
+
+/// Minus the remainder of a polynomial by one of lower degree, with its degree.
+fn negated_remainder(
+    dividend: &[f64; 11],
+    dividend_degree: usize,
+    divisor: &[f64; 11],
+    divisor_degree: usize,
+) -> ([f64; 11], usize) {
+    let mut rest = *dividend;
+    let inverse = 1.0 / divisor[divisor_degree];
+    for top in (divisor_degree..=dividend_degree).rev() {
+        let factor = rest[top] * inverse;
+        for i in 0..=divisor_degree {
+            rest[top - divisor_degree + i] -= factor * divisor[i];
+        }
+        rest[top] = 0.0;
+    }
+    let mut degree = divisor_degree.saturating_sub(1);
+    let largest = rest[..=degree].iter().fold(0.0, |m: f64, value| m.max(value.abs()));
+    while degree > 0 && rest[degree].abs() < 1e-13 * largest {
+        degree -= 1;
+    }
+    (rest.map(|value| -value), degree)
 }
 
 #[inline]
@@ -212,7 +278,8 @@ fn polish(c: &[f64; 11], mut low: f64, mut high: f64) -> Option<f64> {
         }
         let newton = x - value / slope;
         let next = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
-        if (next - x).abs() <= 1e-15 * (1.0 + x.abs()) {
+        // Newton's next step would be its square.
+        if (next - x).abs() <= 1e-9 * (1.0 + x.abs()) {
             return Some(next);
         }
         x = next;

@@ -1,18 +1,22 @@
 //! Robust estimation by random sampling, for any model.
 //!
 //! The loop owns sampling, stopping and the random stream; an [`Estimator`] knows the geometry. Models are compared by the
-//! truncated squared error (MSAC, Torr & Zisserman 2000); each new best is optimised locally (LO-RANSAC, Chum, Matas &
-//! Kittler 2003); the number of samples adapts to the share of inliers (Fischler & Bolles 1981); data in falling order of
-//! quality can be drawn progressively (PROSAC, Chum & Matas 2005). Same data, options and seed give the same result.
+//! truncated squared error (MSAC, Torr & Zisserman 2000), which is given up as soon as it exceeds the best so far (bail-out,
+//! Capel 2005); each new best is optimised locally (LO-RANSAC, Chum, Matas & Kittler 2003); the number of samples adapts to
+//! the share of inliers (Fischler & Bolles 1981); data in falling order of quality can be drawn progressively (PROSAC, Chum &
+//! Matas 2005). Same data, options and seed give the same result on any processor.
 
-use rand::Rng;
-use rand_pcg::Pcg64Mcg;
+mod sampler;
+mod stopping;
+#[cfg(test)]
+mod tests;
+
 use serde::{Deserialize, Serialize};
 
 use crate::Seed;
-
-#[cfg(test)]
-mod tests;
+use sampler::Sampler;
+use stopping::Stopping;
+pub use stopping::iterations_needed;
 
 /// Local optimisations of one model in the loop, and of the best at the end.
 const LOCAL_ROUNDS: usize = 2;
@@ -38,14 +42,31 @@ pub trait Estimator {
     /// How many data there are.
     fn data_len(&self) -> usize;
 
+    /// Fewest data, of those that [`Estimator::screen`] looks at, that must agree with a model for it to be looked at further.
+    /// Default: a sample's worth.
+    fn min_support(&self) -> usize {
+        self.sample_len()
+    }
+
     /// Adds every model that the data at these distinct indices allow; none when they are degenerate.
     fn propose(&self, sample: &[usize], models: &mut Vec<Self::Model>);
 
     /// The score of a model. It may give up early once the cost exceeds `stop_at`, with any cost above it.
     fn score(&self, model: &Self::Model, stop_at: f64) -> Score;
 
+    /// A cheaper score by which the models of samples are compared with each other only, as over part of the data or in
+    /// single precision. Default: the score itself.
+    fn screen(&self, model: &Self::Model, stop_at: f64) -> Score {
+        self.score(model, stop_at)
+    }
+
     /// A model fitted to the data that agree with this one, or `None` when that fails. Need not be better.
     fn refine(&self, model: &Self::Model) -> Option<Self::Model>;
+
+    /// A cheaper refinement for models on the way. Default: the refinement itself.
+    fn refine_briefly(&self, model: &Self::Model) -> Option<Self::Model> {
+        self.refine(model)
+    }
 
     /// The data within the threshold of a model, ascending.
     fn inliers(&self, model: &Self::Model) -> Vec<u32>;
@@ -97,46 +118,51 @@ pub struct Robust<M> {
 
 /// The best model for the data, or `None` when no sample gave a model that at least a sample's worth of data support.
 pub fn run<E: Estimator>(estimator: &E, options: &RansacOptions, seed: Seed) -> Option<Robust<E::Model>> {
+    run_from(estimator, None, options, seed)
+}
+
+/// [`run`] with a model that is known beforehand, as one of a narrower kind: samples must do better, and fewer are drawn when
+/// it is good.
+pub fn run_from<E: Estimator>(
+    estimator: &E,
+    start: Option<E::Model>,
+    options: &RansacOptions,
+    seed: Seed,
+) -> Option<Robust<E::Model>> {
     let (sample_len, data_len) = (estimator.sample_len(), estimator.data_len());
     if sample_len == 0 || data_len < sample_len {
         return None;
     }
     let mut sampler = Sampler::new(options, sample_len, data_len, seed);
+    let mut stopping = Stopping::new(options, sample_len, data_len);
     let mut sample = vec![0; sample_len];
     let mut models = Vec::new();
-    let mut best: Option<(E::Model, Score)> = None;
-    let mut best_minimal_cost = f64::INFINITY;
-    let mut needed = options.max_iterations;
+    let mut best = start.map(|model| {
+        let score = estimator.score(&model, f64::INFINITY);
+        optimise((model, score), LOCAL_ROUNDS, estimator, E::refine_briefly)
+    });
+    if let Some((model, _)) = &best {
+        stopping.set_best(&estimator.inliers(model));
+    }
+    let mut best_screened = f64::INFINITY;
     let mut iterations = 0;
-    while iterations < options.max_iterations && iterations < needed.max(options.min_iterations) {
+    while !stopping.is_enough(iterations, sampler.pool) {
         iterations += 1;
         sampler.draw(&mut sample);
         models.clear();
         estimator.propose(&sample, &mut models);
-        let Some(found) = best_of(estimator, &models, best_minimal_cost) else { continue };
-        best_minimal_cost = found.1.cost;
-        let found = optimise(estimator, found, LOCAL_ROUNDS);
+        let Some((model, screened)) = best_of(estimator, &models, best_screened) else { continue };
+        best_screened = screened.cost;
+        let score = estimator.score(&model, f64::INFINITY);
+        let found = optimise((model, score), LOCAL_ROUNDS, estimator, E::refine_briefly);
         if best.as_ref().is_none_or(|(_, score)| found.1.cost < score.cost) {
-            let share = f64::from(found.1.num_inliers) / data_len as f64;
-            needed = iterations_needed(share, sample_len, options.confidence);
+            stopping.set_best(&estimator.inliers(&found.0));
             best = Some(found);
         }
     }
-    let (model, score) = optimise(estimator, best?, FINAL_ROUNDS);
+    let (model, score) = optimise(best?, FINAL_ROUNDS, estimator, E::refine);
     let inliers = estimator.inliers(&model);
     (inliers.len() >= sample_len).then_some(Robust { model, inliers, cost: score.cost, iterations })
-}
-
-/// How many samples of `sample_len` must be drawn to meet one without outliers with this confidence.
-pub fn iterations_needed(inlier_share: f64, sample_len: usize, confidence: f64) -> u32 {
-    let all_inliers = inlier_share.clamp(0.0, 1.0).powi(i32::try_from(sample_len).unwrap_or(i32::MAX));
-    let allowed_failure = (1.0 - confidence).clamp(f64::MIN_POSITIVE, 1.0);
-    if all_inliers >= 1.0 {
-        return 1;
-    }
-    // `ln_1p` keeps tiny shares, where `1 - x` would round to one; the cast saturates.
-    let needed = (allowed_failure.ln() / (-all_inliers).ln_1p()).ceil();
-    if needed.is_nan() { u32::MAX } else { (needed as u32).max(1) }
 }
 
 /// The MSAC score of errors given one by one; an error that is not a number counts as an outlier.
@@ -173,13 +199,13 @@ pub fn indices_within(
     (0..data_len).filter(|&i| squared_error(i) < max_squared_error).map(|i| i as u32).collect()
 }
 
-/// The best model of one sample, when it beats `cost_to_beat` and has a sample's worth of inliers.
+/// The best model of one sample, when it beats `cost_to_beat` and has inliers enough.
 fn best_of<E: Estimator>(estimator: &E, models: &[E::Model], cost_to_beat: f64) -> Option<(E::Model, Score)> {
     let mut best: Option<(usize, Score)> = None;
     for (index, model) in models.iter().enumerate() {
         let limit = best.map_or(cost_to_beat, |(_, score)| score.cost);
-        let score = estimator.score(model, limit);
-        if score.cost < limit && score.num_inliers as usize >= estimator.sample_len() {
+        let score = estimator.screen(model, limit);
+        if score.cost < limit && score.num_inliers as usize >= estimator.min_support() {
             best = Some((index, score));
         }
     }
@@ -187,87 +213,27 @@ fn best_of<E: Estimator>(estimator: &E, models: &[E::Model], cost_to_beat: f64) 
 }
 
 /// Refines while that helps, at most so many times.
-fn optimise<E: Estimator>(estimator: &E, start: (E::Model, Score), rounds: usize) -> (E::Model, Score) {
+fn optimise<E: Estimator>(
+    start: (E::Model, Score),
+    rounds: usize,
+    estimator: &E,
+    refine: impl Fn(&E, &E::Model) -> Option<E::Model>,
+) -> (E::Model, Score) {
+    /// Gains below this share are not worth another round.
+    const MIN_GAIN: f64 = 1e-3;
     let mut best = start;
     for _ in 0..rounds {
-        let Some(model) = estimator.refine(&best.0) else { break };
+        let Some(model) = refine(estimator, &best.0) else { break };
         let score = estimator.score(&model, best.1.cost);
-        // Gains below this are rounding; they would only burn rounds.
         let gained = best.1.cost - score.cost;
         if !(gained > 0.0) {
             break;
         }
-        let done = gained < 1e-6 * best.1.cost;
+        let done = gained < MIN_GAIN * best.1.cost;
         best = (model, score);
         if done {
             break;
         }
     }
     best
-}
-
-/// Draws samples of distinct indices, uniformly or progressively.
-struct Sampler {
-    rng: Pcg64Mcg,
-    sample_len: usize,
-    data_len: usize,
-    drawn: f64,
-    /// PROSAC: samples come from the first `pool` data until `drawn` reaches `pool_until`.
-    pool: usize,
-    pool_until: f64,
-    mean_draws: f64,
-}
-
-impl Sampler {
-    /// After this many samples PROSAC is plain RANSAC (Chum & Matas 2005).
-    const MAX_GROWTH: f64 = 200_000.0;
-
-    fn new(options: &RansacOptions, sample_len: usize, data_len: usize, seed: Seed) -> Self {
-        let mut mean_draws = f64::from(options.max_iterations).min(Self::MAX_GROWTH);
-        for i in 0..sample_len {
-            mean_draws *= (sample_len - i) as f64 / (data_len - i) as f64;
-        }
-        let pool = match options.order {
-            SampleOrder::Uniform => data_len,
-            SampleOrder::FallingQuality => sample_len,
-        };
-        let rng = seed.derive(b"ransac").rng();
-        Self { rng, sample_len, data_len, drawn: 0.0, pool, pool_until: 1.0, mean_draws }
-    }
-
-    fn draw(&mut self, sample: &mut [usize]) {
-        self.drawn += 1.0;
-        while self.drawn > self.pool_until && self.pool < self.data_len {
-            let next = (self.pool + 1) as f64;
-            let grown = self.mean_draws * next / (next - self.sample_len as f64);
-            self.pool_until += (grown - self.mean_draws).ceil();
-            self.mean_draws = grown;
-            self.pool += 1;
-        }
-        if self.pool >= self.data_len {
-            self.draw_from(self.data_len, sample);
-        } else {
-            // The newest of the pool is always in; the others come from before it.
-            let (last, others) = sample.split_last_mut().expect("a sample has at least one datum");
-            *last = self.pool - 1;
-            self.draw_from(self.pool - 1, others);
-        }
-    }
-
-    fn draw_from(&mut self, len: usize, sample: &mut [usize]) {
-        for k in 0..sample.len() {
-            loop {
-                let index = below(&mut self.rng, len);
-                if !sample[..k].contains(&index) {
-                    sample[k] = index;
-                    break;
-                }
-            }
-        }
-    }
-}
-
-/// A number below `len`; own arithmetic, so that results outlive changes of the random library.
-fn below(rng: &mut Pcg64Mcg, len: usize) -> usize {
-    ((u128::from(rng.next_u64()) * len as u128) >> 64) as usize
 }

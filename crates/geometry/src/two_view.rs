@@ -5,6 +5,7 @@
 //! rotations and poses; in any unit, as pixels, for fundamental matrices and homographies. Thresholds have the points' unit.
 //! Slices of one pair have equal length, and may arrive in falling order of quality (see [`ransac::SampleOrder`]).
 
+mod columns;
 mod estimators;
 mod pose;
 #[cfg(test)]
@@ -37,6 +38,20 @@ pub fn estimate_essential(
     ransac::run(&Essentials::new(first, second, threshold)?, options, seed)
 }
 
+/// A fundamental matrix improved on the correspondences that agree with it, with those that then do.
+///
+/// As the last step of [`estimate_fundamental`], from a matrix that is known already, as that of an essential matrix. `None` when
+/// fewer than eight agree.
+pub fn improve_fundamental(
+    start: &Matrix3<f64>,
+    first: &[Vector2<f64>],
+    second: &[Vector2<f64>],
+    threshold: f64,
+) -> Option<Robust<Matrix3<f64>>> {
+    let none = RansacOptions { max_iterations: 0, ..RansacOptions::default() };
+    estimate_fundamental_from(Some(start), first, second, threshold, &none, Seed(0))
+}
+
 /// The fundamental matrix `second ᵀ F first = 0` (Frobenius norm one) that most correspondences agree with.
 ///
 /// Seven-point solver on normalised points; Sampson errors, local refinement over matrices of rank two. `None` as for
@@ -48,9 +63,27 @@ pub fn estimate_fundamental(
     options: &RansacOptions,
     seed: Seed,
 ) -> Option<Robust<Matrix3<f64>>> {
+    estimate_fundamental_from(None, first, second, threshold, options, seed)
+}
+
+/// [`estimate_fundamental`] with a matrix that is known beforehand, as that of an essential matrix: samples must do better, and
+/// fewer are drawn when it is good.
+pub fn estimate_fundamental_from(
+    start: Option<&Matrix3<f64>>,
+    first: &[Vector2<f64>],
+    second: &[Vector2<f64>],
+    threshold: f64,
+    options: &RansacOptions,
+    seed: Seed,
+) -> Option<Robust<Matrix3<f64>>> {
     let normalized = Normalized::new(first, second)?;
-    let found = ransac::run(&Fundamentals::new(&normalized, threshold), options, seed)?;
-    let matrix = normalized.second_transform().transpose() * found.model * normalized.first_transform();
+    let (to_first, to_second) = (normalized.first_transform(), normalized.second_transform());
+    let start = start.and_then(|matrix| {
+        let moved = normalized.second_inverse().transpose() * matrix * normalized.first_inverse();
+        moved.iter().all(|value| value.is_finite()).then(|| moved.normalize())
+    });
+    let found = ransac::run_from(&Fundamentals::new(&normalized, threshold), start, options, seed)?;
+    let matrix = to_second.transpose() * found.model * to_first;
     Some(in_unit(found, matrix.normalize(), normalized.scale))
 }
 
@@ -65,8 +98,19 @@ pub fn estimate_homography(
     options: &RansacOptions,
     seed: Seed,
 ) -> Option<Robust<Matrix3<f64>>> {
+    homography_with(first, second, threshold, 0.0, options, seed)
+}
+
+fn homography_with(
+    first: &[Vector2<f64>],
+    second: &[Vector2<f64>],
+    threshold: f64,
+    min_share: f64,
+    options: &RansacOptions,
+    seed: Seed,
+) -> Option<Robust<Matrix3<f64>>> {
     let normalized = Normalized::new(first, second)?;
-    let found = ransac::run(&Homographies::new(&normalized, threshold), options, seed)?;
+    let found = ransac::run(&Homographies::new(&normalized, threshold, min_share), options, seed)?;
     let matrix = normalized.second_inverse() * found.model * normalized.first_transform();
     Some(in_unit(found, matrix.normalize(), normalized.scale))
 }
@@ -83,6 +127,32 @@ pub fn estimate_rotation(
     seed: Seed,
 ) -> Option<Robust<UnitQuaternion<f64>>> {
     ransac::run(&Rotations::new(first, second, threshold)?, options, seed)
+}
+
+/// The rotation that nearly all correspondences agree with, and those that do; no sampling.
+///
+/// Least squares over directions (Horn 1987), then over the `share` of them that fits best, again and again (least trimmed
+/// squares by concentration, Rousseeuw & Van Driessen 2006). `None` when fewer than `share` of the correspondences agree.
+pub fn dominant_rotation(
+    first: &[Vector2<f64>],
+    second: &[Vector2<f64>],
+    threshold: f64,
+    share: f64,
+) -> Option<(UnitQuaternion<f64>, Vec<u32>)> {
+    Rotations::new(first, second, threshold)?.dominant(share)
+}
+
+/// The homography that nearly all correspondences agree with, as [`estimate_homography`]: models of samples that fewer than
+/// half of `share` of the correspondences agree with are not looked at further. `None` when there is none.
+pub fn dominant_homography(
+    first: &[Vector2<f64>],
+    second: &[Vector2<f64>],
+    threshold: f64,
+    share: f64,
+    options: &RansacOptions,
+    seed: Seed,
+) -> Option<Robust<Matrix3<f64>>> {
+    homography_with(first, second, threshold, 0.5 * share, options, seed)
 }
 
 /// A result of normalised points in the caller's unit.

@@ -82,7 +82,7 @@ impl Correspondences {
         }
         let in_border = |camera: &Camera, point: &Vector2<f64>| {
             let (width, height) = (f64::from(camera.width_px), f64::from(camera.height_px));
-            let margin = border * width.hypot(height);
+            let margin = border * (width * width + height * height).sqrt();
             point.x < margin || point.y < margin || point.x > width - margin || point.y > height - margin
         };
         let stays = (a_px - b_px).norm() <= self.threshold_px;
@@ -136,6 +136,18 @@ impl Correspondences {
         (0..self.len()).filter(agrees).map(|i| i as u32).collect()
     }
 
+    /// An epipolar matrix on the planes z = 1 as one in pixels without distortion; `None` for a focal length of zero.
+    pub(super) fn in_pixels(&self, matrix: &Matrix3<f64>) -> Option<Matrix3<f64>> {
+        let [first, second] = self.cameras.map(|camera| intrinsic_matrix(&camera).try_inverse());
+        Some(second?.transpose() * matrix * first?)
+    }
+
+    /// An epipolar matrix in pixels without distortion as one on the planes z = 1.
+    pub(super) fn on_planes(&self, matrix: &Matrix3<f64>) -> Matrix3<f64> {
+        let [first, second] = self.cameras.map(|camera| intrinsic_matrix(&camera));
+        second.transpose() * matrix * first
+    }
+
     /// How many of these stay at their place in the border.
     pub(super) fn num_static(&self, indices: &[u32]) -> usize {
         indices.iter().filter(|&&i| self.is_static[i as usize]).count()
@@ -155,6 +167,12 @@ impl Correspondences {
         };
         MatchedPair { summary, matches }
     }
+}
+
+/// The matrix that takes points of the plane z = 1 to pixels, without distortion.
+fn intrinsic_matrix(camera: &Camera) -> Matrix3<f64> {
+    let (focal, center) = (camera.focal_px(), camera.principal_point_px());
+    Matrix3::new(focal.x, 0.0, center.x, 0.0, focal.y, center.y, 0.0, 0.0, 1.0)
 }
 
 /// At most `count` of `len` places, evenly spread.

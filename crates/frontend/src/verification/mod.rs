@@ -5,6 +5,7 @@
 //! (Schönberger & Frahm 2016). Matches that stay at one place near the border are a watermark, not a scene.
 
 mod correspondences;
+mod guided;
 mod models;
 mod pose;
 #[cfg(test)]
@@ -17,6 +18,8 @@ use terrane_scene::{CameraRecord, ImagePair, Keypoint, MatchedPair};
 
 use crate::matching::Match;
 use correspondences::Correspondences;
+pub use guided::{GuidedMatching, Photograph, STRONGEST, match_and_verify};
+use models::Geometry;
 
 /// One image of a pair.
 #[derive(Clone, Copy, Debug)]
@@ -61,6 +64,8 @@ pub struct VerificationOptions {
     /// The pair is a watermark when at least this share of its inliers stays at its place in the border. Default 0.7
     /// (COLMAP).
     pub min_watermark_share: f64,
+    /// Whether [`match_and_verify`] looks for more matches along epipolar lines. Default: see [`GuidedMatching`].
+    pub guided: GuidedMatching,
     /// Sampling. Matches come in falling order of quality, so progressive sampling finds what there is early. Default: 30
     /// to 3000 samples with confidence 0.9999, progressive.
     pub ransac: RansacOptions,
@@ -76,6 +81,7 @@ impl Default for VerificationOptions {
             min_rotation_share: 0.9,
             watermark_border: 0.1,
             min_watermark_share: 0.7,
+            guided: GuidedMatching::default(),
             ransac: RansacOptions {
                 max_iterations: 3000,
                 min_iterations: 30,
@@ -120,6 +126,15 @@ pub fn verify(
     options: &VerificationOptions,
     seed: Seed,
 ) -> Result<MatchedPair, NotVerified> {
+    let (points, geometry) = geometry(candidate, options, seed)?;
+    Ok(points.matched_pair(candidate.pair, &geometry))
+}
+
+fn geometry(
+    candidate: &Candidate<'_>,
+    options: &VerificationOptions,
+    seed: Seed,
+) -> Result<(Correspondences, Geometry), NotVerified> {
     let needed = options.min_inliers.max(8);
     let points = Correspondences::new(candidate, options);
     if points.len() < needed as usize {
@@ -131,5 +146,5 @@ pub fn verify(
         let found = geometry.inliers.len() as u32;
         return Err(NotVerified::TooFewInliers { found, matches: points.len() as u32, needed });
     }
-    Ok(points.matched_pair(candidate.pair, &geometry))
+    Ok((points, geometry))
 }

@@ -11,8 +11,8 @@ const MAX_COMPARED: usize = 400;
 
 /// Factors on a guessed focal length are looked for from one over this to this.
 const MAX_FOCAL_FACTOR: f64 = 2.5;
-/// Steps from the least factor to the greatest.
-const FOCAL_STEPS: i32 = 40;
+/// From one factor that is tried to the next.
+const FOCAL_STEP: f64 = 1.047;
 /// Another focal length must lower the cost to this share: near-degenerate views fit any.
 const NEEDED_GAIN: f64 = 0.9;
 
@@ -69,13 +69,28 @@ pub(super) fn best(estimate: &PoseEstimate<'_>) -> Option<FoundPose> {
 }
 
 impl FoundPose {
+    /// The pose after a refinement on these correspondences.
+    pub(super) fn refined_on(&self, points: &Correspondences, indices: &[u32]) -> Self {
+        Scaled::new(points, indices, self.focal_factor).refined(&self.second_from_first)
+    }
+
     /// Correspondences that agree with the pose at the focal lengths given, ascending.
-    pub(super) fn agreeing(&self, points: &Correspondences) -> Vec<u32> {
+    ///
+    /// With `near`, a fundamental matrix in pixels that was fitted from this pose, also those that agree with it: lenses bend
+    /// lines a little more than their models say, above all far from the centre.
+    pub(super) fn agreeing(&self, points: &Correspondences, near: Option<&Matrix3<f64>>) -> Vec<u32> {
         let pose = &self.second_from_first;
         let ahead = |&i: &u32| {
             !is_behind(pose, &points.first[i as usize], &points.second[i as usize], points.threshold)
         };
-        points.within(&essential_from_pose(pose)).into_iter().filter(ahead).collect()
+        let mut agreeing = points.within(&essential_from_pose(pose));
+        if let Some(near) = near {
+            agreeing.extend(points.within_px(near));
+            agreeing.sort_unstable();
+            agreeing.dedup();
+        }
+        agreeing.retain(ahead);
+        agreeing
     }
 
     /// Median angle of the rays of correspondences.
@@ -154,27 +169,30 @@ fn rescaled(matrix: &Matrix3<f64>, factors: [f64; 2]) -> Matrix3<f64> {
 /// The factor on guessed focal lengths that brings the singular values of a matrix closest to each other; `None` when that
 /// is at an end of the range, where the views do not tell.
 fn focal_factor(matrix: &Matrix3<f64>, is_guessed: [bool; 2]) -> Option<f64> {
-    let inequality = |log: f64| {
-        let factors = is_guessed.map(|guessed| if guessed { log.exp() } else { 1.0 });
+    let inequality = |factor: f64| {
+        let factors = is_guessed.map(|guessed| if guessed { factor } else { 1.0 });
         // Of a matrix of rank two: ((σ₁² − σ₂²) / (σ₁² + σ₂²))², from the invariants of MᵀM.
         let scaled = rescaled(matrix, factors);
         let squared = scaled.tr_mul(&scaled);
         let (sum, sum_of_squares) = (squared.trace(), (squared * squared).trace());
         (2.0 * sum_of_squares - sum * sum) / (sum * sum)
     };
-    let step = 2.0 * MAX_FOCAL_FACTOR.ln() / f64::from(FOCAL_STEPS);
-    let at = |k: i32| -MAX_FOCAL_FACTOR.ln() + f64::from(k) * step;
-    let best = (0..=FOCAL_STEPS).min_by(|&a, &b| inequality(at(a)).total_cmp(&inequality(at(b))))?;
-    if best == 0 || best == FOCAL_STEPS {
+    let mut factors = vec![1.0 / MAX_FOCAL_FACTOR];
+    while let Some(&last) = factors.last().filter(|last| **last < MAX_FOCAL_FACTOR) {
+        factors.push(last * FOCAL_STEP);
+    }
+    let last = factors.len() - 1;
+    let best = (0..=last).min_by(|&a, &b| inequality(factors[a]).total_cmp(&inequality(factors[b])))?;
+    if best == 0 || best == last {
         return None;
     }
     // Thirds of the interval are dropped until it is narrow enough.
-    let (mut low, mut high) = (at(best - 1), at(best + 1));
+    let (mut low, mut high) = (factors[best - 1], factors[best + 1]);
     for _ in 0..12 {
         let third = (high - low) / 3.0;
         if inequality(low + third) < inequality(high - third) { high -= third } else { low += third }
     }
-    Some(((low + high) / 2.0).exp())
+    Some((low + high) / 2.0)
 }
 
 /// Whether the rays of a correspondence surely meet behind a camera: rays that are parallel within the noise may meet anywhere.

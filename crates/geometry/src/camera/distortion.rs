@@ -170,8 +170,8 @@ fn fold_r2(k1: f64, k2: f64) -> f64 {
 fn undistort_radial(k1: f64, k2: f64, distorted: &Vector2<f64>) -> Option<Vector2<f64>> {
     const MAX_ITERATIONS: usize = 60;
     let target = distorted.norm();
-    if target < f64::EPSILON {
-        return Some(*distorted);
+    if target < f64::EPSILON || k1 == 0.0 && k2 == 0.0 {
+        return target.is_finite().then_some(*distorted);
     }
     let (mut low, mut high) = (0.0, fold_r2(k1, k2).sqrt());
     let value = |r: f64| r * (1.0 + r * r * (k1 + r * r * k2)) - target;
@@ -181,6 +181,9 @@ fn undistort_radial(k1: f64, k2: f64, distorted: &Vector2<f64>) -> Option<Vector
     let mut r = if target < high { target } else { 0.5 * high };
     for _ in 0..MAX_ITERATIONS {
         let residual = value(r);
+        if residual == 0.0 {
+            break;
+        }
         if residual > 0.0 {
             high = r
         } else {

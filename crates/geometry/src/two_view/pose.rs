@@ -4,6 +4,7 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector2};
 use smallvec::SmallVec;
 
 use crate::Rigid3;
+use crate::elementary::angle_rad;
 use crate::epipolar::{Correspondences, PoseProblem, essential_from_pose, squared_sampson_error};
 use crate::homography::decompose_homography;
 use crate::linear::proper_svd3;
@@ -74,8 +75,8 @@ pub fn poses_from_homography(
     found.into_iter().take(2).map(|(pose, _)| pose).collect()
 }
 
-/// The relative pose near `start` that minimises the Sampson errors of the correspondences at `indices` under a Cauchy
-/// loss of this scale (in the unit of the plane z = 1). The translation stays of length one. Not worse than the start.
+/// The relative pose near `start` that minimises the Sampson errors of the correspondences at `indices` under the
+/// loss of Geman & McClure (1987) of this scale (in the unit of the plane z = 1). The translation stays of length one. Not worse than the start.
 pub fn refine_relative_pose(
     start: &Rigid3,
     first: &[Vector2<f64>],
@@ -88,7 +89,8 @@ pub fn refine_relative_pose(
         indices.iter().copied().filter(|&i| (i as usize) < first.len().min(second.len())).collect();
     let data = Correspondences { first, second, indices: &in_range, loss_scale };
     let unit = Rigid3::new(start.rotation, direction);
-    small_lm::minimize(&PoseProblem(data), unit, &LmOptions::default()).0
+    let options = LmOptions { max_iterations: 12, cost_tolerance: 1e-7, ..LmOptions::default() };
+    small_lm::minimize(&PoseProblem(data), unit, &options).0
 }
 
 /// The angle, in radians, at which the rays of a correspondence on the plane z = 1 meet, given the rotation between views.
@@ -98,7 +100,7 @@ pub fn parallax_angle_rad(
     second: &Vector2<f64>,
 ) -> f64 {
     let (a, b) = (rotation * first.push(1.0), second.push(1.0));
-    a.cross(&b).norm().atan2(a.dot(&b))
+    angle_rad(a.cross(&b).norm(), a.dot(&b))
 }
 
 /// The four poses of an essential matrix, translations of length one.
@@ -145,7 +147,7 @@ fn angle_if_in_front(pose: &Rigid3, first: &Vector2<f64>, second: &Vector2<f64>)
     let normal = a.cross(&b);
     let depth_first = pose.translation.cross(&b).dot(&-normal);
     let depth_second = pose.translation.cross(&a).dot(&-normal);
-    let angle = normal.norm().atan2(a.dot(&b));
+    let angle = angle_rad(normal.norm(), a.dot(&b));
     (depth_first > 0.0 && depth_second > 0.0 && angle > MIN_PARALLAX_RAD).then_some(angle)
 }
 
