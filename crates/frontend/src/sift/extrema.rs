@@ -74,7 +74,7 @@ impl Detector {
     pub(super) fn search_row(
         &mut self,
         isa: Isa,
-        differences: &[RowRing],
+        differences: &[RowRing<i16>],
         y: usize,
         columns: &Range<usize>,
         found: &mut Vec<Extremum>,
@@ -94,7 +94,7 @@ impl Detector {
         }
     }
 
-    fn refine(&self, differences: &[RowRing], start: Cell) -> Option<Extremum> {
+    fn refine(&self, differences: &[RowRing<i16>], start: Cell) -> Option<Extremum> {
         let mut cell = start;
         let mut values = neighborhood_of(differences, cell);
         let mut fit = fit(&values)?;
@@ -163,20 +163,24 @@ fn marked<'a>(marks: &'a [u8], columns: &Range<usize>) -> impl Iterator<Item = u
 fn is_extremum(levels: &[[&[i16]; 3]], x: usize) -> bool {
     let value = i32::from(levels[1][1][x]);
     let sign = if value < 0 { -1 } else { 1 };
-    let rows = levels.iter().flatten().map(|row| &row[x - 1..=x + 1]);
-    rows.enumerate().all(|(row, neighbors)| {
-        neighbors.iter().enumerate().all(|(column, neighbor)| {
-            let difference = sign * (value - i32::from(*neighbor));
-            let place = 3 * row + column;
-            difference > 0 || (difference == 0 && place >= 13)
-        })
-    })
+    // How far the value is above those that come first, and above or level with those that come later.
+    let (mut above_first, mut above_later) = (i32::MAX, i32::MAX);
+    for (row, values) in levels.iter().flatten().enumerate() {
+        for (column, neighbor) in values[x - 1..=x + 1].iter().enumerate() {
+            let above = sign * (value - i32::from(*neighbor));
+            match 3 * row + column {
+                0..13 => above_first = above_first.min(above),
+                _ => above_later = above_later.min(above),
+            }
+        }
+    }
+    above_first > 0 && above_later >= 0
 }
 
 /// A cell and its 26 neighbours, by level, row and column.
 type Neighborhood = [[[f64; 3]; 3]; 3];
 
-fn neighborhood_of(differences: &[RowRing], Cell { x, y, s }: Cell) -> Neighborhood {
+fn neighborhood_of(differences: &[RowRing<i16>], Cell { x, y, s }: Cell) -> Neighborhood {
     std::array::from_fn(|ds| {
         std::array::from_fn(|dy| {
             let row = differences[s + ds - 1].row(y + dy - 1);

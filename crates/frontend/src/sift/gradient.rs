@@ -59,7 +59,7 @@ struct Gradients {
 fn gradients(plane: &Plane, x: usize, y: usize) -> Gradients {
     let stride = plane.size.width;
     let at = y * stride + x;
-    let values = |at: usize| -> &[i16; LANES] {
+    let values = |at: usize| -> &[u16; LANES] {
         plane.data[at..].first_chunk().expect("planes have slack behind them")
     };
     let (left, right) = (values(at - 1), values(at + 1));

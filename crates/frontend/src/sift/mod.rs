@@ -20,6 +20,7 @@ mod rows;
 mod select;
 #[cfg(test)]
 mod tests;
+mod weighted;
 
 use rayon::prelude::*;
 use terrane_scene::{DESCRIPTOR_LEN, Features, Keypoint};

@@ -49,24 +49,24 @@ pub(super) fn sigma_of_level(s: f64) -> f64 {
 }
 
 /// The last rows of an image that is made row by row. Rows are padded to whole blocks.
-pub(super) struct RowRing {
+pub(super) struct RowRing<T> {
     stride: usize,
     capacity: usize,
-    data: Vec<i16>,
+    data: Vec<T>,
 }
 
-impl RowRing {
+impl<T: Copy + Default> RowRing<T> {
     pub(super) fn new(width: usize, capacity: usize) -> Self {
         let stride = width.next_multiple_of(BLOCK);
-        Self { stride, capacity, data: vec![0; stride * capacity] }
+        Self { stride, capacity, data: vec![T::default(); stride * capacity] }
     }
 
-    pub(super) fn row(&self, y: usize) -> &[i16] {
+    pub(super) fn row(&self, y: usize) -> &[T] {
         let at = (y % self.capacity) * self.stride;
         &self.data[at..at + self.stride]
     }
 
-    pub(super) fn row_mut(&mut self, y: usize) -> &mut [i16] {
+    pub(super) fn row_mut(&mut self, y: usize) -> &mut [T] {
         let at = (y % self.capacity) * self.stride;
         &mut self.data[at..at + self.stride]
     }
@@ -76,7 +76,7 @@ impl RowRing {
 pub(super) struct Plane {
     pub size: Size,
     /// `width * height` values and [`Plane::SLACK`] behind them.
-    pub data: Vec<i16>,
+    pub data: Vec<u16>,
 }
 
 impl Plane {
@@ -87,13 +87,13 @@ impl Plane {
         Self { size, data: vec![0; size.width * size.height + Self::SLACK] }
     }
 
-    fn row(&self, y: usize) -> &[i16] {
+    fn row(&self, y: usize) -> &[u16] {
         &self.data[y * self.size.width..(y + 1) * self.size.width]
     }
 
     /// The rows of each of some ranges of columns, which follow one another.
-    fn columns_mut(&mut self, ranges: &[Range<usize>]) -> Vec<Vec<&mut [i16]>> {
-        let mut parts: Vec<Vec<&mut [i16]>> =
+    fn columns_mut(&mut self, ranges: &[Range<usize>]) -> Vec<Vec<&mut [u16]>> {
+        let mut parts: Vec<Vec<&mut [u16]>> =
             ranges.iter().map(|_| Vec::with_capacity(self.size.height)).collect();
         let pixels = self.size.width * self.size.height;
         for mut row in self.data[..pixels].chunks_exact_mut(self.size.width.max(1)) {
@@ -139,7 +139,7 @@ enum BaseRows<'a> {
 }
 
 impl BaseRows<'_> {
-    fn row(&mut self, isa: Isa, y: usize, out: &mut [i16]) {
+    fn row(&mut self, isa: Isa, y: usize, out: &mut [u16]) {
         match self {
             Self::Photo(image) => image.row(isa, y, out),
             Self::Kept(plane, columns) => {
@@ -164,7 +164,7 @@ pub(super) fn run(isa: Isa, base: Base<'_>, thresholds: &Thresholds, tile_column
     let halves: Vec<Range<usize>> =
         tiles.iter().map(|tile| tile.core.start / 2..tile.core.end.div_ceil(2)).collect();
     let mut levels: Vec<Plane> = (0..LEVELS).map(|_| Plane::new(size.half())).collect();
-    let mut kept: Vec<Vec<Vec<&mut [i16]>>> = tiles.iter().map(|_| Vec::with_capacity(LEVELS)).collect();
+    let mut kept: Vec<Vec<Vec<&mut [u16]>>> = tiles.iter().map(|_| Vec::with_capacity(LEVELS)).collect();
     for level in &mut levels {
         for (kept, part) in kept.iter_mut().zip(level.columns_mut(&halves)) {
             kept.push(part);
@@ -206,9 +206,9 @@ struct Stream<'a> {
     blurs: Vec<Taps>,
     /// By how many rows each image trails the first.
     delays: [usize; IMAGES],
-    images: Vec<RowRing>,
-    differences: Vec<RowRing>,
-    padded: Vec<i16>,
+    images: Vec<RowRing<u16>>,
+    differences: Vec<RowRing<i16>>,
+    padded: Vec<u16>,
 }
 
 impl<'a> Stream<'a> {
@@ -234,7 +234,7 @@ impl<'a> Stream<'a> {
     }
 
     /// Writes every second row and column of the core of levels 1 to [`LEVELS`] to `kept`; returns the extrema.
-    fn run(mut self, base: Base<'_>, thresholds: &Thresholds, kept: &mut [Vec<&mut [i16]>]) -> Vec<Extremum> {
+    fn run(mut self, base: Base<'_>, thresholds: &Thresholds, kept: &mut [Vec<&mut [u16]>]) -> Vec<Extremum> {
         let Tile { columns, core } = self.tile;
         let inside = core.start - columns.start..core.end - columns.start;
         let mut base = base.rows(columns);
