@@ -4,12 +4,15 @@
 //! Pictures that are not in `--pictures` yet are rendered into it. `benches/peers/sift_colmap.py` reads them and writes the
 //! folder that `--peer` names.
 
+#[path = "peer/mod.rs"]
+mod peer;
+
 use std::path::{Path, PathBuf};
 
 use terrane_frontend::image::{self, GrayImage};
 use terrane_frontend::matching::{MatchOptions, match_features};
 use terrane_frontend::sift::{FirstOctave, SiftOptions, extract};
-use terrane_scene::{DESCRIPTOR_LEN, Features, Keypoint};
+use terrane_scene::Features;
 use terrane_testkit::homographies::{Condition, Picture, Score, conditions, score};
 
 /// The middle of a photograph that pictures are rendered from.
@@ -17,13 +20,13 @@ const MIDDLE_PX: (usize, usize) = (1200, 900);
 
 fn main() {
     let mut options = SiftOptions { max_features: 3000, ..SiftOptions::default() };
-    let (mut pictures, mut peer, mut photos) = (PathBuf::from("."), None, Vec::new());
+    let (mut pictures, mut peer_dir, mut photos) = (PathBuf::from("."), None, Vec::new());
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
         let mut value = || arguments.next().unwrap_or_else(|| panic!("{argument} needs a value"));
         match argument.as_str() {
             "--pictures" => pictures = PathBuf::from(value()),
-            "--peer" => peer = Some(PathBuf::from(value())),
+            "--peer" => peer_dir = Some(PathBuf::from(value())),
             "--max" => options.max_features = value().parse().expect("a number"),
             "--spread" => options.spread = value().parse().expect("a number"),
             "--first-octave" if value() == "-1" => options.first_octave = FirstOctave::Doubled,
@@ -36,9 +39,17 @@ fn main() {
     for photo in &photos {
         let all = render(photo, &conditions, &pictures);
         let size = (all[0].1.width, all[0].1.height);
-        let ours: Vec<Features> = all.iter().map(|(_, picture)| extract(picture, None, &options)).collect();
         let theirs: Option<Vec<Features>> =
-            peer.as_ref().map(|dir| all.iter().map(|(name, _)| read_peer(&dir.join(name))).collect());
+            peer_dir.as_ref().map(|dir: &PathBuf| all.iter().map(|(name, _)| peer::read(&dir.join(name))).collect());
+        // As many features a picture as the peer kept: it counts blobs, not orientations.
+        let budget = |k: usize| theirs.as_ref().map_or(options.max_features, |theirs| theirs[k].len() as u32);
+        let ours: Vec<Features> = all
+            .iter()
+            .enumerate()
+            .map(|(k, (_, picture))| {
+                extract(picture, None, &SiftOptions { max_features: budget(k).max(1), ..options.clone() })
+            })
+            .collect();
         for (k, condition) in conditions.iter().enumerate() {
             let map = condition.second_from_first(size.0, size.1);
             let second_size = (all[k].1.width, all[k].1.height);
@@ -91,26 +102,6 @@ fn write_png(file: &Path, picture: &Picture) {
     let mut encoder = png::Encoder::new(out, picture.width as u32, picture.height as u32);
     encoder.set_color(png::ColorType::Grayscale);
     encoder.write_header().and_then(|mut w| w.write_image_data(&picture.pixels)).expect("writable");
-}
-
-/// Features as `benches/peers/sift_colmap.py` writes them: their number in 64 bits, x, y, scale and orientation of each in
-/// 32-bit floating point, then the descriptors.
-fn read_peer(picture: &Path) -> Features {
-    let file = PathBuf::from(format!("{}.sift", picture.display()));
-    let bytes = std::fs::read(&file).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
-    let count = u64::from_le_bytes(bytes[..8].try_into().expect("eight bytes")) as usize;
-    let number = |k: usize| f32::from_le_bytes(bytes[8 + 4 * k..][..4].try_into().expect("four bytes"));
-    let keypoint = |k: usize| Keypoint {
-        x_px: number(4 * k),
-        y_px: number(4 * k + 1),
-        scale_px: number(4 * k + 2),
-        orientation_rad: number(4 * k + 3),
-    };
-    Features {
-        keypoints: (0..count).map(keypoint).collect(),
-        descriptors: bytes[8 + 16 * count..][..DESCRIPTOR_LEN * count].to_vec(),
-        colors: vec![[0; 3]; count],
-    }
 }
 
 /// Means over photographs.
