@@ -1,98 +1,139 @@
-//! Gaussian kernels and the first image of the scale space.
+//! Gaussian kernels.
+//!
+//! An image that is blurred already holds next to nothing at high frequencies, so that a further blur may skip pixels: a
+//! kernel with taps at every d-th pixel is the Gaussian plus its repetitions at multiples of the frequency 2π/d, and the
+//! image has nothing there for them to act on (the algorithme à trous: Holschneider et al. 1989). The spacing is the
+//! largest whose worst error, relative to the contrast of a grating, is below [`MAX_ALIAS`].
 
 use super::isa::Isa;
 use super::math::exp;
-use super::rows::{ColumnPair, MARGIN, RowPair, blur_columns, blur_rows};
+use super::rows::{MARGIN, MAX_TAPS};
+use super::weighted::{Term, sum_weighted};
 
-/// One half of a symmetric kernel: the weights of pixels at distances `start`, `start + 1`, …, where `start` is 0 or ½.
-///
-/// Kernels are cut off at four standard deviations and add up to one.
+/// The largest error that sparse taps may make, as a part of any grating's contrast.
+const MAX_ALIAS: f64 = 1e-3;
+
+/// A symmetric kernel: weights, which add up to 65,536, by distance from its centre in pixels.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Taps {
-    /// True when the kernel's centre lies halfway between two pixels.
-    pub between: bool,
-    /// Weights by distance; of a kernel that is centred on a pixel the first is halved, for it counts twice.
-    pub weights: Vec<f32>,
+    /// Distances rounded down: of a kernel centred between pixels 0 and 1, the pixel 1 lies at 1.
+    distances: Vec<isize>,
+    weights: Vec<u16>,
 }
 
 impl Taps {
-    /// A Gaussian of a standard deviation in pixels, at most 4.
+    /// A Gaussian of a standard deviation in pixels, at most 4, cut off at four standard deviations, with taps at every
+    /// pixel and its centre on a pixel or `between` two.
     pub(super) fn gaussian(sigma_px: f64, between: bool) -> Self {
+        Self::spaced(sigma_px, 1, between)
+    }
+
+    /// The Gaussian that takes an image from a blur of `from_px` to one of `to_px`.
+    pub(super) fn increment(from_px: f64, to_px: f64) -> Self {
+        let (from, added) = (from_px * from_px, to_px * to_px - from_px * from_px);
+        let alias = |spacing: usize| {
+            let repetition = std::f64::consts::TAU / spacing as f64;
+            exp(-0.5 * repetition * repetition * from * added / (from + added))
+        };
+        let spacing = (2..=4).take_while(|&spacing| alias(spacing) < MAX_ALIAS).last().unwrap_or(1);
+        Self::spaced(added.sqrt(), spacing, false)
+    }
+
+    fn spaced(sigma_px: f64, spacing: usize, between: bool) -> Self {
         let start = if between { 0.5 } else { 0.0 };
-        let count = ((4.0 * sigma_px - start).ceil().max(0.0) as usize + 1).min(MARGIN);
-        let mut weights: Vec<f64> = (0..count)
-            .map(|k| {
-                let distance = (k as f64 + start) / sigma_px;
+        let arm = ((4.0 * sigma_px - start) / spacing as f64).ceil().max(0.0) as usize;
+        let arm = arm.min((MAX_TAPS - 2) / 2).min((MARGIN - 1) / spacing) as isize;
+        let first = -arm;
+        let last = if between { arm + 1 } else { arm };
+        let distances: Vec<isize> = (first..=last).map(|k| k * spacing as isize).collect();
+        let exact: Vec<f64> = distances
+            .iter()
+            .map(|distance| {
+                let distance = (*distance as f64 - start) / sigma_px;
                 exp(-0.5 * distance * distance)
             })
             .collect();
-        if !between {
-            weights[0] *= 0.5;
-        }
-        let sum: f64 = 2.0 * weights.iter().sum::<f64>();
-        Self { between, weights: weights.into_iter().map(|w| (w / sum) as f32).collect() }
+        Self { distances, weights: fixed(&exact) }
     }
 
-    /// How many rows before the centre's (rounded down) the kernel needs; after it, one more when it lies between.
+    /// How many pixels away from the centre's (rounded down) the kernel looks.
     pub(super) fn radius(&self) -> usize {
-        self.weights.len() - 1
+        self.distances.last().map_or(0, |distance| distance.unsigned_abs())
     }
 
-    /// The pairs of rows around `center`; `row` maps a row number, possibly outside the image, to pixels.
-    pub(super) fn rows<'a>(&self, center: usize, row: impl Fn(isize) -> &'a [f32]) -> Vec<RowPair<'a>> {
-        let center = center as isize;
-        let shift = isize::from(self.between);
-        let pair = |(k, &weight): (usize, &f32)| {
-            let k = k as isize;
-            RowPair { first: row(center - k), second: row(center + k + shift), weight }
-        };
-        self.weights.iter().enumerate().map(pair).collect()
+    /// One row: the blur along columns of the rows that `row` gives for row numbers, possibly outside the image.
+    pub(super) fn blur_rows<'a>(
+        &self,
+        isa: Isa,
+        center: usize,
+        row: impl Fn(isize) -> &'a [u16],
+        out: &mut [u16],
+    ) {
+        let mut terms = [Term::default(); MAX_TAPS];
+        for (term, (distance, weight)) in terms.iter_mut().zip(self.distances.iter().zip(&self.weights)) {
+            *term = Term { pixels: row(center as isize + distance), weight: *weight };
+        }
+        sum_weighted(isa, &terms[..self.weights.len()], out);
     }
 
-    /// The pairs of columns of a padded row.
-    pub(super) fn columns(&self) -> Vec<ColumnPair> {
-        let shift = usize::from(self.between);
-        let pair = |(k, &weight): (usize, &f32)| ColumnPair {
-            first: MARGIN - k,
-            second: MARGIN + k + shift,
-            weight,
-        };
-        self.weights.iter().enumerate().map(pair).collect()
+    /// The blur along a row whose pixel 0 stands at [`MARGIN`].
+    pub(super) fn blur_columns(&self, isa: Isa, padded: &[u16], out: &mut [u16]) {
+        let mut terms = [Term::default(); MAX_TAPS];
+        for (term, (distance, weight)) in terms.iter_mut().zip(self.distances.iter().zip(&self.weights)) {
+            *term = Term { pixels: &padded[MARGIN.wrapping_add_signed(*distance)..], weight: *weight };
+        }
+        sum_weighted(isa, &terms[..self.weights.len()], out);
     }
 }
 
+/// Weights as parts of 65,536; what rounding leaves over goes to the middle.
+fn fixed(exact: &[f64]) -> Vec<u16> {
+    let sum: f64 = exact.iter().sum();
+    let mut weights: Vec<i32> = exact.iter().map(|w| (w / sum * 65_536.0).round() as i32).collect();
+    let rest = 65_536 - weights.iter().sum::<i32>();
+    let middle = weights.len() / 2;
+    match weights.len() % 2 {
+        1 => weights[middle] += rest,
+        // A rest is even here, for the kernel is symmetric.
+        _ => weights[middle - 1..=middle].iter_mut().for_each(|weight| *weight += rest / 2),
+    }
+    weights.into_iter().map(|weight| weight.clamp(0, 65_535) as u16).collect()
+}
+
 /// Repeats the first and the last of `width` pixels, which start at [`MARGIN`], into the margins.
-pub(super) fn fill_margins(padded: &mut [f32], width: usize) {
+pub(super) fn fill_margins(padded: &mut [u16], width: usize) {
     let first = padded[MARGIN];
     padded[..MARGIN].fill(first);
     let last = padded[MARGIN + width - 1];
     padded[MARGIN + width..].fill(last);
 }
 
-/// A separable blur of one standard deviation.
-pub(super) struct Blur {
-    /// Weights along columns.
-    pub taps: Taps,
-    columns: Vec<ColumnPair>,
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
 
-impl Blur {
-    pub(super) fn new(taps: Taps) -> Self {
-        let columns = taps.columns();
-        Self { taps, columns }
+    /// What a kernel makes of a grating's contrast, and a Gaussian's exact answer.
+    fn responses(taps: &Taps, sigma_px: f64, frequency: f64) -> (f64, f64) {
+        let sum = |(distance, weight): (&isize, &u16)| {
+            f64::from(*weight) / 65_536.0 * (frequency * *distance as f64).cos()
+        };
+        let got = taps.distances.iter().zip(&taps.weights).map(sum).sum();
+        (got, (-0.5 * (frequency * sigma_px).powi(2)).exp())
     }
 
-    /// One row of the blurred image into `out`, from rows around `center`.
-    pub(super) fn row<'a>(
-        &self,
-        isa: Isa,
-        (center, width): (usize, usize),
-        row: impl Fn(isize) -> &'a [f32],
-        (padded, out): (&mut [f32], &mut [f32]),
-    ) {
-        let stride = out.len();
-        blur_rows(isa, &self.taps.rows(center, row), &mut padded[MARGIN..MARGIN + stride]);
-        fill_margins(padded, width);
-        blur_columns(isa, padded, &self.columns, out);
+    #[test]
+    fn increments_blur_as_gaussians_do_what_the_image_still_holds() {
+        for level in 0..5 {
+            let (from, to) = (1.6 * 2.0_f64.powf(level as f64 / 3.0), 1.6 * 2.0_f64.powf((level + 1) as f64 / 3.0));
+            let taps = Taps::increment(from, to);
+            assert_eq!(taps.weights.iter().map(|w| u32::from(*w)).sum::<u32>(), 65_536);
+            assert!(taps.distances.len() <= 11 && taps.radius() <= 12);
+            for k in 0..=100 {
+                let frequency = std::f64::consts::PI * f64::from(k) / 100.0;
+                let (got, exact) = responses(&taps, (to * to - from * from).sqrt(), frequency);
+                let held = (-0.5 * (frequency * from).powi(2)).exp();
+                assert!(held * (got - exact).abs() < 1.5e-3, "{level} {frequency}: {got} {exact}");
+            }
+        }
     }
 }

@@ -69,11 +69,10 @@ fn smoothed(histogram: &[f32; ORIENTATION_BINS]) -> [f32; ORIENTATION_BINS] {
 pub(super) fn describe(isa: Isa, place: &Place<'_>, orientation_rad: f32) -> [u8; DESCRIPTOR_LEN] {
     let (cosine, sine) = cos_sin(f64::from(orientation_rad));
     let cells_per_px = 1.0 / (CELL_SIGMAS * f64::from(place.sigma));
-    let turn = orientation_rad / std::f32::consts::TAU;
+    let turned = [[cosine, sine], [-sine, cosine]];
     let frame = Frame {
-        cosine: (cosine * cells_per_px) as f32,
-        sine: (sine * cells_per_px) as f32,
-        eighths: 8.0 * if turn < 0.0 { turn + 1.0 } else { turn },
+        cells_from_px: turned.map(|row| row.map(|v| (v * cells_per_px) as f32)),
+        gradient: turned.map(|row| row.map(|v| v as f32)),
     };
     let mut roomy = [0.0_f32; ROOMY_LEN];
     gather_descriptor(isa, place, &frame, &mut roomy);

@@ -1,8 +1,10 @@
 //! Extrema of the differences of Gaussians, refined to fractions of a pixel (Lowe 2004, Brown & Lowe 2002).
 
+use std::ops::Range;
+
 use super::isa::Isa;
-use super::octave::{LEVELS, RowRing, Size, sigma_of_level};
-use super::rows::{mark_extrema, neighborhood};
+use super::octave::{LEVELS, RowRing, sigma_of_level};
+use super::rows::{UNITS_PER_GREY, mark_extrema};
 
 /// A blob, in pixels of its octave; the first pixel's centre is at (0, 0).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -19,13 +21,27 @@ pub(super) struct Extremum {
     pub response: f32,
 }
 
-/// Thresholds of the search, and its buffers.
-pub(super) struct Detector {
-    contrast: f64,
+/// What an extremum must exceed.
+#[derive(Clone, Copy)]
+pub(super) struct Thresholds {
+    contrast_units: f64,
     edge_bound: f64,
-    largest: Vec<Vec<f32>>,
-    smallest: Vec<Vec<f32>>,
-    scratch: Vec<f32>,
+}
+
+impl Thresholds {
+    /// `contrast` in greys; `edge` is the largest ratio of principal curvatures.
+    pub(super) fn new(contrast: f64, edge: f64) -> Self {
+        Self { contrast_units: contrast * UNITS_PER_GREY, edge_bound: (edge + 1.0) * (edge + 1.0) / edge }
+    }
+}
+
+/// The search of a tile.
+pub(super) struct Detector {
+    thresholds: Thresholds,
+    /// Column of the octave that the tile starts at.
+    first_column: usize,
+    height: usize,
+    width: usize,
     marks: Vec<u8>,
 }
 
@@ -50,61 +66,40 @@ impl Detector {
     /// Rows before and after the searched one that must be there: refinement moves at most two and looks one further.
     pub(super) const REACH: usize = 3;
 
-    /// `contrast` in greys; `edge` is the largest ratio of principal curvatures.
-    pub(super) fn new(contrast: f64, edge: f64) -> Self {
-        let empty = || vec![Vec::new(); LEVELS + 2];
-        Self {
-            contrast,
-            edge_bound: (edge + 1.0) * (edge + 1.0) / edge,
-            largest: empty(),
-            smallest: empty(),
-            scratch: Vec::new(),
-            marks: Vec::new(),
-        }
+    pub(super) fn new(thresholds: &Thresholds, first_column: usize, height: usize, width: usize) -> Self {
+        Self { thresholds: *thresholds, first_column, height, width, marks: vec![0; width] }
     }
 
-    /// Appends what is found in row `y`, an inner row, of the middle differences: by level, then by column.
+    /// Appends what is found in `columns` of row `y`, an inner row, of the middle differences: by level, then by column.
     pub(super) fn search_row(
         &mut self,
         isa: Isa,
-        differences: &[RowRing],
-        size: Size,
+        differences: &[RowRing<i16>],
         y: usize,
+        columns: &Range<usize>,
         found: &mut Vec<Extremum>,
     ) {
-        self.fit_buffers(size.width);
-        for (s, ring) in differences.iter().enumerate() {
-            let rows = [ring.row(y - 1), ring.row(y), ring.row(y + 1)];
-            neighborhood(isa, rows, &mut self.scratch, &mut self.largest[s], &mut self.smallest[s]);
-        }
+        let rows: [[&[i16]; 3]; LEVELS + 2] =
+            std::array::from_fn(|s| std::array::from_fn(|dy| differences[s].row(y + dy - 1)));
         // A little below the threshold: interpolation raises the value.
-        let threshold = (0.8 * self.contrast) as f32;
+        let threshold = (0.8 * self.thresholds.contrast_units).clamp(1.0, 32_767.0) as i16;
         for s in 1..=LEVELS {
-            let bounds = [s - 1, s, s + 1].map(|s| (self.largest[s].as_slice(), self.smallest[s].as_slice()));
-            mark_extrema(isa, differences[s].row(y), bounds, threshold, &mut self.marks);
-            for x in marked(&self.marks, size.width) {
-                let cell = Cell { x, y, s };
-                if is_extremum(differences, cell) {
-                    found.extend(self.refine(differences, size, cell));
+            let [above, row, below] = rows[s];
+            mark_extrema(isa, &[above, row, below, rows[s - 1][1], rows[s + 1][1]], threshold, &mut self.marks);
+            for x in marked(&self.marks, columns) {
+                if is_extremum(&rows[s - 1..=s + 1], x) {
+                    found.extend(self.refine(differences, Cell { x, y, s }));
                 }
             }
         }
     }
 
-    fn fit_buffers(&mut self, width: usize) {
-        if self.marks.len() != width {
-            self.largest.iter_mut().chain(&mut self.smallest).for_each(|row| row.resize(width, 0.0));
-            self.scratch.resize(2 * width, 0.0);
-            self.marks.resize(width, 0);
-        }
-    }
-
-    fn refine(&self, differences: &[RowRing], size: Size, start: Cell) -> Option<Extremum> {
+    fn refine(&self, differences: &[RowRing<i16>], start: Cell) -> Option<Extremum> {
         let mut cell = start;
         let mut values = neighborhood_of(differences, cell);
         let mut fit = fit(&values)?;
         for _ in 0..MAX_MOVES {
-            let next = neighbor(cell, &fit.offset, size, start.y);
+            let next = self.neighbor(cell, &fit.offset, start);
             if next == cell {
                 break;
             }
@@ -113,67 +108,79 @@ impl Detector {
             fit = self::fit(&values)?;
         }
         let is_near = fit.offset.iter().all(|o| o.abs() < 1.0);
-        if !is_near || fit.value.abs() < self.contrast || !(0.0..self.edge_bound).contains(&fit.edge_ratio) {
+        let Thresholds { contrast_units, edge_bound } = self.thresholds;
+        if !is_near || fit.value.abs() < contrast_units || !(0.0..edge_bound).contains(&fit.edge_ratio) {
             return None;
         }
         let [dx, dy, ds] = fit.offset;
         let [dx, dy] = unbiased_place(&values, ds).unwrap_or([dx, dy]);
         let s = cell.s as f64 + ds;
         Some(Extremum {
-            x: (cell.x as f64 + dx) as f32,
+            x: ((self.first_column + cell.x) as f64 + dx) as f32,
             y: (cell.y as f64 + dy) as f32,
             sigma: sigma_of_level(s) as f32,
             level: (s.round() as i64).clamp(1, LEVELS as i64) as u8,
-            response: fit.value.abs() as f32,
+            response: (fit.value.abs() / UNITS_PER_GREY) as f32,
         })
+    }
+
+    /// The neighbour that the extremum of a fit lies in, as far as it can be reached from the start.
+    fn neighbor(&self, cell: Cell, offset: &[f64; 3], start: Cell) -> Cell {
+        let moved = |at: usize, offset: f64, low: usize, high: usize| {
+            let to = if offset > 0.6 {
+                at + 1
+            } else if offset < -0.6 {
+                at - 1
+            } else {
+                at
+            };
+            to.clamp(low, high)
+        };
+        let reach = Self::REACH - 1;
+        let range = |start: usize, len: usize| (start.saturating_sub(reach).max(1), (start + reach).min(len - 2));
+        let ((low_x, high_x), (low_y, high_y)) = (range(start.x, self.width), range(start.y, self.height));
+        Cell {
+            x: moved(cell.x, offset[0], low_x, high_x),
+            y: moved(cell.y, offset[1], low_y, high_y),
+            s: moved(cell.s, offset[2], 1, LEVELS),
+        }
     }
 }
 
-/// Columns that are marked, but the first and the last.
-fn marked(marks: &[u8], width: usize) -> impl Iterator<Item = usize> + '_ {
-    let blocks = marks.chunks(8).enumerate().filter(|(_, block)| block.iter().fold(0, |a, b| a | b) != 0);
-    blocks
-        .flat_map(|(index, block)| {
-            block.iter().enumerate().filter(|(_, m)| **m != 0).map(move |(k, _)| 8 * index + k)
-        })
-        .filter(move |&x| x >= 1 && x + 1 < width)
+/// Those of some columns that are marked.
+fn marked<'a>(marks: &'a [u8], columns: &Range<usize>) -> impl Iterator<Item = usize> + 'a {
+    let first = columns.start;
+    let (whole, rest) = marks[columns.clone()].as_chunks::<32>();
+    let blocks = whole.iter().map(|block| block.as_slice()).chain(std::iter::once(rest)).enumerate();
+    blocks.filter(|(_, block)| block.iter().fold(0, |a, b| a | b) != 0).flat_map(move |(index, block)| {
+        let places = block.iter().enumerate().filter(|(_, mark)| **mark != 0);
+        places.map(move |(k, _)| first + 32 * index + k)
+    })
 }
 
 /// Beyond all of its 26 neighbours. Of level neighbours the first one is the extremum, so that a blob midway between
 /// pixels is found once.
-fn is_extremum(differences: &[RowRing], cell: Cell) -> bool {
-    let values = neighborhood_of(differences, cell);
-    let values = values.as_flattened().as_flattened();
-    let sign = values[13].signum();
-    let value = sign * values[13];
-    values[..13].iter().all(|v| value > sign * v) && values[14..].iter().all(|v| value >= sign * v)
-}
-
-/// The neighbour that the extremum of a fit lies in, as far as it can be reached.
-fn neighbor(cell: Cell, offset: &[f64; 3], size: Size, start_y: usize) -> Cell {
-    let moved = |at: usize, offset: f64, low: usize, high: usize| {
-        let to = if offset > 0.6 {
-            at + 1
-        } else if offset < -0.6 {
-            at - 1
-        } else {
-            at
-        };
-        to.clamp(low, high)
-    };
-    let reach = Detector::REACH - 1;
-    let (low_y, high_y) = (start_y.saturating_sub(reach).max(1), (start_y + reach).min(size.height - 2));
-    Cell {
-        x: moved(cell.x, offset[0], 1, size.width - 2),
-        y: moved(cell.y, offset[1], low_y, high_y),
-        s: moved(cell.s, offset[2], 1, LEVELS),
+fn is_extremum(levels: &[[&[i16]; 3]], x: usize) -> bool {
+    let value = i32::from(levels[1][1][x]);
+    let sign = if value < 0 { -1 } else { 1 };
+    // How far the value is above those that come first, and above or level with those that come later.
+    let (mut above_first, mut above_later) = (i32::MAX, i32::MAX);
+    for (row, values) in levels.iter().flatten().enumerate() {
+        for (column, neighbor) in values[x - 1..=x + 1].iter().enumerate() {
+            let above = sign * (value - i32::from(*neighbor));
+            match 3 * row + column {
+                0..13 => above_first = above_first.min(above),
+                _ => above_later = above_later.min(above),
+            }
+        }
     }
+    above_first > 0 && above_later >= 0
 }
 
 /// A cell and its 26 neighbours, by level, row and column.
 type Neighborhood = [[[f64; 3]; 3]; 3];
 
-fn neighborhood_of(differences: &[RowRing], Cell { x, y, s }: Cell) -> Neighborhood {
+fn neighborhood_of(differences: &[RowRing<i16>], Cell { x, y, s }: Cell) -> Neighborhood {
     std::array::from_fn(|ds| {
         std::array::from_fn(|dy| {
             let row = differences[s + ds - 1].row(y + dy - 1);

@@ -4,84 +4,90 @@
 //! interpolated and then blurred; both are one Gaussian, sampled at whole distances for even rows and columns and
 //! between them for odd ones.
 
-use super::blur::{Blur, Taps, fill_margins};
+use std::ops::Range;
+
+use super::blur::Taps;
 use super::isa::Isa;
-use super::octave::{RowRing, Size};
-use super::rows::{BLOCK, MARGIN, blur_columns, blur_rows};
+use super::octave::{BASE_SIGMA, RowRing, Size};
+use super::rows::{BLOCK, MARGIN, interleave, to_fixed};
 use crate::image::GrayImage;
 
 /// Standard deviation in pixels that a photograph is taken to have been blurred with already (Lowe 2004).
 const CAMERA_BLUR_PX: f64 = 0.5;
 
-/// A photograph as a source of rows of its blurred (and doubled) version.
+/// The size of the first image.
+pub(super) fn size_of_first(photo: &GrayImage, doubled: bool) -> Size {
+    let factor = if doubled { 2 } else { 1 };
+    Size { width: factor * photo.width, height: factor * photo.height }
+}
+
+/// Some columns of a photograph as a source of rows of its blurred (and doubled) version.
 pub(super) struct FirstImage<'a> {
     photo: &'a GrayImage,
     doubled: bool,
+    /// Columns of the photograph that rows are made of; the margins hold their neighbours.
+    columns: Range<usize>,
     /// On pixels, and between them for the doubled image.
-    phases: Vec<Blur>,
-    /// Rows of the photograph as floating-point numbers; all before `converted` have been in it.
-    source: RowRing,
+    phases: Vec<Taps>,
+    /// Rows of the photograph with margins; all before `converted` have been in it.
+    source: RowRing<u16>,
     converted: usize,
-    padded: Vec<f32>,
-    scratch: Vec<f32>,
+    padded: Vec<u16>,
+    even: Vec<u16>,
+    odd: Vec<u16>,
 }
 
 impl<'a> FirstImage<'a> {
-    /// A source whose rows have been blurred to `sigma_px` of its own pixels in all.
-    pub(super) fn new(photo: &'a GrayImage, doubled: bool, sigma_px: f64) -> Self {
-        let scale = if doubled { 2.0 } else { 1.0 };
-        let sigma_in_photo = ((sigma_px / scale).powi(2) - CAMERA_BLUR_PX * CAMERA_BLUR_PX).max(0.01).sqrt();
-        let phases: Vec<Blur> = [false, true]
-            .into_iter()
-            .take(if doubled { 2 } else { 1 })
-            .map(|between| Blur::new(Taps::gaussian(sigma_in_photo, between)))
-            .collect();
-        let radius = phases.iter().map(|blur| blur.taps.radius() + 1).max().unwrap_or(0);
-        let source = RowRing::new(photo.width, 2 * radius + 1);
-        let stride = photo.width.next_multiple_of(BLOCK);
-        let padded = vec![0.0; stride + 2 * MARGIN];
-        Self { photo, doubled, phases, source, converted: 0, padded, scratch: vec![0.0; 2 * stride] }
-    }
-
-    /// Columns and rows of the image.
-    pub(super) fn size(&self) -> Size {
-        let factor = if self.doubled { 2 } else { 1 };
-        Size { width: factor * self.photo.width, height: factor * self.photo.height }
+    /// A source of `columns` of the first image, the first of which is even.
+    pub(super) fn new(photo: &'a GrayImage, doubled: bool, columns: &Range<usize>) -> Self {
+        let factor = if doubled { 2 } else { 1 };
+        let sigma = BASE_SIGMA / factor as f64;
+        let added_px = (sigma * sigma - CAMERA_BLUR_PX * CAMERA_BLUR_PX).max(0.01).sqrt();
+        let phases: Vec<Taps> =
+            [false, true][..factor].iter().map(|&between| Taps::gaussian(added_px, between)).collect();
+        let columns = columns.start / factor..columns.end.div_ceil(factor);
+        let radius = phases.iter().map(Taps::radius).max().unwrap_or(0);
+        let padded_len = columns.len().next_multiple_of(BLOCK) + 2 * MARGIN;
+        let source = RowRing::new(padded_len, 2 * radius + 1);
+        let padded = vec![0; padded_len.next_multiple_of(BLOCK)];
+        let (even, odd) = match doubled {
+            true => (vec![0; columns.len().next_multiple_of(BLOCK)], vec![0; columns.len().next_multiple_of(BLOCK)]),
+            false => (Vec::new(), Vec::new()),
+        };
+        Self { photo, doubled, columns, phases, source, converted: 0, padded, even, odd }
     }
 
     /// Writes row `y`; rows are asked for in order.
-    pub(super) fn row(&mut self, isa: Isa, y: usize, out: &mut [f32]) {
+    pub(super) fn row(&mut self, isa: Isa, y: usize, out: &mut [u16]) {
         let (center, phase) = if self.doubled { (y / 2, y % 2) } else { (y, 0) };
-        let radius = self.phases[phase].taps.radius() + 1;
-        self.convert_through((center + radius).min(self.photo.height - 1));
-        let (photo, source) = (self.photo, &self.source);
-        let last_row = photo.height as isize - 1;
-        let row = |y: isize| source.row(y.clamp(0, last_row) as usize);
-        if !self.doubled {
-            self.phases[0].row(isa, (center, photo.width), row, (&mut self.padded, out));
-            return;
-        }
-        let stride = self.scratch.len() / 2;
-        blur_rows(isa, &self.phases[phase].taps.rows(center, row), &mut self.padded[MARGIN..MARGIN + stride]);
-        fill_margins(&mut self.padded, photo.width);
-        let (even, odd) = self.scratch.split_at_mut(stride);
-        blur_columns(isa, &self.padded, &self.phases[0].taps.columns(), even);
-        blur_columns(isa, &self.padded, &self.phases[1].taps.columns(), odd);
-        for (pair, (even, odd)) in out.chunks_exact_mut(2).zip(even.iter().zip(odd.iter())) {
-            pair[0] = *even;
-            pair[1] = *odd;
-        }
-    }
-
-    fn convert_through(&mut self, last: usize) {
-        let width = self.photo.width;
-        while self.converted <= last {
-            let pixels = &self.photo.data[self.converted * width..(self.converted + 1) * width];
-            let row = self.source.row_mut(self.converted);
-            for (out, pixel) in row.iter_mut().zip(pixels) {
-                *out = f32::from(*pixel);
-            }
+        let vertical = &self.phases[phase];
+        let last_row = self.photo.height - 1;
+        let needed = (center + vertical.radius()).min(last_row);
+        while self.converted <= needed {
+            convert(isa, self.photo, &self.columns, self.converted, self.source.row_mut(self.converted));
             self.converted += 1;
         }
+        let row = |y: isize| self.source.row(y.clamp(0, last_row as isize) as usize);
+        vertical.blur_rows(isa, center, row, &mut self.padded);
+        match self.phases.as_slice() {
+            [on, between] => {
+                on.blur_columns(isa, &self.padded, &mut self.even);
+                between.blur_columns(isa, &self.padded, &mut self.odd);
+                interleave(isa, &self.even, &self.odd, out);
+            }
+            phases => phases[0].blur_columns(isa, &self.padded, out),
+        }
     }
+}
+
+/// A row of the photograph with what stands beside its columns, or the nearest pixel where there is nothing.
+fn convert(isa: Isa, photo: &GrayImage, columns: &Range<usize>, y: usize, out: &mut [u16]) {
+    let pixels = &photo.data[y * photo.width..(y + 1) * photo.width];
+    let before = columns.start.min(MARGIN);
+    let end = (columns.end + MARGIN).min(photo.width);
+    let inside = MARGIN - before..MARGIN + end - columns.start;
+    to_fixed(isa, &pixels[columns.start - before..end], &mut out[inside.clone()]);
+    let (first, last) = (out[inside.start], out[inside.end - 1]);
+    out[..inside.start].fill(first);
+    out[inside.end..].fill(last);
 }

@@ -2,12 +2,12 @@
 
 use super::isa::{Isa, kernel};
 use super::math::{direction_in_eighths, exp_f32};
-use super::octave::FixedPlane;
+use super::octave::Plane;
 
 /// Pixels that are turned into gradients at once.
-const LANES: usize = 16;
-/// The widest window: a descriptor's diagonal at the coarsest level, in whole blocks.
-const MAX_SPAN: usize = 96;
+const LANES: usize = 8;
+/// The widest window for orientations in whole vectors: 4.5 standard deviations of at most 2.02 pixels on both sides.
+const MAX_SPAN: usize = 32;
 
 /// Bins of an orientation histogram (Lowe 2004).
 pub(super) const ORIENTATION_BINS: usize = 36;
@@ -21,22 +21,22 @@ pub(super) const RIMMED_CELLS: usize = CELLS + 2;
 pub(super) const ROOMY_DIRECTIONS: usize = DIRECTIONS + 2;
 pub(super) const ROOMY_LEN: usize = RIMMED_CELLS * RIMMED_CELLS * ROOMY_DIRECTIONS;
 
-/// A place in a level of the scale space.
+/// A place in a level of the scale space, in pixels of the plane.
 #[derive(Clone, Copy)]
 pub(super) struct Place<'a> {
-    pub plane: &'a FixedPlane,
+    pub plane: &'a Plane,
     pub x: f32,
     pub y: f32,
     pub sigma: f32,
 }
 
-/// The axes of a descriptor: cosine and sine of its orientation over the width of a cell, and the orientation in
-/// eighths of a turn.
+/// The axes of a descriptor.
 #[derive(Clone, Copy)]
 pub(super) struct Frame {
-    pub cosine: f32,
-    pub sine: f32,
-    pub eighths: f32,
+    /// From pixels of the plane, relative to the place, to cells, relative to the middle.
+    pub cells_from_px: [[f32; 2]; 2],
+    /// From gradients of the plane to gradients along the cells' axes, up to a common factor.
+    pub gradient: [[f32; 2]; 2],
 }
 
 kernel!(
@@ -49,26 +49,25 @@ kernel!(
     gather_descriptor = gather_descriptor_body(place: &Place<'_>, frame: &Frame, histogram: &mut [f32; ROOMY_LEN])
 );
 
-/// Strength (without a common factor) and direction in eighths of a turn of [`LANES`] gradients.
+/// [`LANES`] gradients, without a common factor.
 struct Gradients {
-    magnitude: [f32; LANES],
-    direction: [f32; LANES],
+    across: [f32; LANES],
+    down: [f32; LANES],
 }
 
 #[inline(always)]
-fn gradients(plane: &FixedPlane, x: usize, y: usize) -> Gradients {
-    let at = y * plane.stride + x;
+fn gradients(plane: &Plane, x: usize, y: usize) -> Gradients {
+    let stride = plane.size.width;
+    let at = y * stride + x;
     let values = |at: usize| -> &[u16; LANES] {
         plane.data[at..].first_chunk().expect("planes have slack behind them")
     };
     let (left, right) = (values(at - 1), values(at + 1));
-    let (above, below) = (values(at - plane.stride), values(at + plane.stride));
-    let mut out = Gradients { magnitude: [0.0; LANES], direction: [0.0; LANES] };
+    let (above, below) = (values(at - stride), values(at + stride));
+    let mut out = Gradients { across: [0.0; LANES], down: [0.0; LANES] };
     for lane in 0..LANES {
-        let dx = f32::from(right[lane]) - f32::from(left[lane]);
-        let dy = f32::from(below[lane]) - f32::from(above[lane]);
-        out.magnitude[lane] = (dx * dx + dy * dy).sqrt();
-        out.direction[lane] = direction_in_eighths(dx, dy);
+        out.across[lane] = (i32::from(right[lane]) - i32::from(left[lane])) as f32;
+        out.down[lane] = (i32::from(below[lane]) - i32::from(above[lane])) as f32;
     }
     out
 }
@@ -129,9 +128,10 @@ fn gather_orientations_body(place: &Place<'_>, histogram: &mut [f32; ORIENTATION
                 weights[offset.min(MAX_SPAN - LANES)..].first_chunk().expect("in range");
             let (mut bins, mut near, mut far) = ([0_u32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
             for lane in 0..LANES {
-                let bin = gradients.direction[lane].mul_add(ORIENTATION_BINS as f32 / 8.0, 35.5);
+                let (dx, dy) = (gradients.across[lane], gradients.down[lane]);
+                let bin = direction_in_eighths(dx, dy).mul_add(ORIENTATION_BINS as f32 / 8.0, 35.5);
                 let (whole, index) = split(bin);
-                let weight = gradients.magnitude[lane] * (column_weights[lane] * row_weight);
+                let weight = (dx * dx + dy * dy).sqrt() * (column_weights[lane] * row_weight);
                 far[lane] = (bin - whole) * weight;
                 near[lane] = weight - far[lane];
                 bins[lane] = index;
@@ -157,7 +157,8 @@ const REACH: f32 = 2.5;
 #[inline(always)]
 fn chord(frame: &Frame, dy: f32) -> (f32, f32) {
     let (mut low, mut high) = (-1e4_f32, 1e4_f32);
-    for (along, across) in [(frame.cosine, frame.sine * dy), (-frame.sine, frame.cosine * dy)] {
+    for [along, across] in frame.cells_from_px {
+        let across = across * dy;
         if along.abs() > 1e-6 {
             let (a, b) = ((-REACH - across) / along, (REACH - across) / along);
             low = low.max(a.min(b));
@@ -172,26 +173,20 @@ fn chord(frame: &Frame, dy: f32) -> (f32, f32) {
 #[inline(always)]
 fn gather_descriptor_body(place: &Place<'_>, frame: &Frame, histogram: &mut [f32; ROOMY_LEN]) {
     let Place { plane, x, y, .. } = *place;
-    // Per cell squared: a Gaussian of two cells.
-    let falloff = -0.125 * (frame.cosine * frame.cosine + frame.sine * frame.sine);
-    let radius = REACH * (frame.cosine.abs() + frame.sine.abs())
-        / (frame.cosine * frame.cosine + frame.sine * frame.sine);
-    let (first_column, last_column) = range(x, radius, plane.size.width);
-    let (first_row, last_row) = range(y, radius, plane.size.height);
-    let weights = column_weights(first_column, x, falloff);
+    let [[a, b], [c, d]] = frame.cells_from_px;
+    let per_determinant = REACH / (a * d - b * c).abs();
+    let (reach_x, reach_y) = ((b.abs() + d.abs()) * per_determinant, (a.abs() + c.abs()) * per_determinant);
+    let (first_column, last_column) = range(x, reach_x, plane.size.width);
+    let (first_row, last_row) = range(y, reach_y, plane.size.height);
     for row in first_row..=last_row {
         let dy = row as f32 - y;
         let (low, high) = chord(frame, dy);
         let low = ((x + low).max(0.0) as i32).max(first_column);
         let high = ((x + high).min(1e6) as i32 + 1).min(last_column);
-        let row_weight = exp_f32((dy * dy * falloff).max(-80.0));
         let mut column = low;
         while column <= high {
-            let offset = ((column - first_column) as usize).min(MAX_SPAN - LANES);
-            let column_weights: &[f32; LANES] = weights[offset..].first_chunk().expect("in range");
             let gradients = gradients(plane, column as usize, row as usize);
-            let samples =
-                Samples::new(&gradients, frame, (column as f32 - x, dy), (column_weights, row_weight));
+            let samples = Samples::new(&gradients, frame, (column as f32 - x, dy));
             samples.scatter(((high - column + 1) as usize).min(LANES), histogram);
             column += LANES as i32;
         }
@@ -209,29 +204,30 @@ struct Samples {
 
 impl Samples {
     #[inline(always)]
-    fn new(
-        gradients: &Gradients,
-        frame: &Frame,
-        (dx, dy): (f32, f32),
-        (column_weights, row_weight): (&[f32; LANES], f32),
-    ) -> Self {
+    fn new(gradients: &Gradients, frame: &Frame, (dx, dy): (f32, f32)) -> Self {
         let zeros = [0.0_f32; LANES];
         let mut out = Self { index: [0; LANES], weight: zeros, across: zeros, down: zeros, around: zeros };
         // From the middle of the window to the rim's first cell.
         const SHIFT: f32 = (RIMMED_CELLS as f32 - 1.0) / 2.0;
         const LAST: f32 = RIMMED_CELLS as f32 - 1.001;
+        let [[a, b], [c, d]] = frame.cells_from_px;
+        let [[e, f], [g, h]] = frame.gradient;
         for lane in 0..LANES {
             let dx = dx + lane as f32;
-            let column = frame.cosine.mul_add(dx, frame.sine * dy) + SHIFT;
-            let row = frame.cosine.mul_add(dy, -(frame.sine * dx)) + SHIFT;
+            let (column, row) = (a.mul_add(dx, b * dy), c.mul_add(dx, d * dy));
+            // A Gaussian of two cells.
+            let exponent = (column * column + row * row) * -0.125;
+            let weight = exp_f32(if exponent < -80.0 { -80.0 } else { exponent });
+            let (column, row) = (column + SHIFT, row + SHIFT);
             let inside = (column > 0.0) & (column < LAST) & (row > 0.0) & (row < LAST);
             let (column, row) = if inside { (column, row) } else { (1.0, 1.0) };
-            let turn = gradients.direction[lane] - frame.eighths;
-            let turn = if turn < 0.0 { turn + 8.0 } else { turn };
+            let (gx, gy) = (gradients.across[lane], gradients.down[lane]);
+            let (gx, gy) = (e.mul_add(gx, f * gy), g.mul_add(gx, h * gy));
             let (column_whole, column_index) = split(column);
             let (row_whole, row_index) = split(row);
+            let turn = direction_in_eighths(gx, gy);
             let (turn_whole, turn_index) = split(turn);
-            let weight = gradients.magnitude[lane] * (column_weights[lane] * row_weight);
+            let weight = (gx * gx + gy * gy).sqrt() * weight;
             out.weight[lane] = if inside { weight } else { 0.0 };
             out.across[lane] = column - column_whole;
             out.down[lane] = row - row_whole;

@@ -1,8 +1,8 @@
 //! Scale-invariant features: SIFT (Lowe 2004) with RootSIFT descriptors in eight bits.
 //!
-//! The scale space is streamed row by row (see `octave`), so that memory is little more than three levels of the finest
-//! octave in 16 bits: about 16 bytes a pixel of the photograph from octave 0, 60 from octave −1. Coordinates follow the
-//! project's convention: the centre of the first pixel is (0.5, 0.5).
+//! The scale space is streamed row by row in 16-bit fixed point (see `octave`), and a quarter of three levels is kept for
+//! descriptors: 2 bytes a pixel of the photograph from octave 0, 8 from octave −1, besides the photograph and the features.
+//! Coordinates follow the project's convention: the centre of the first pixel is (0.5, 0.5).
 //!
 //! Features are the same bytes on any number of threads and any processor: kernels fix their operations and their
 //! order (see `isa`), and no function of the C library is called.
@@ -20,17 +20,17 @@ mod rows;
 mod select;
 #[cfg(test)]
 mod tests;
+mod weighted;
 
 use rayon::prelude::*;
 use terrane_scene::{DESCRIPTOR_LEN, Features, Keypoint};
 
 use crate::image::{GrayImage, RgbImage};
 use descriptor::{describe, orientations};
-use extrema::{Detector, Extremum};
-use first::FirstImage;
+use extrema::{Extremum, Thresholds};
 use gradient::Place;
 use isa::Isa;
-use octave::{BASE_SIGMA, Base, Octave};
+use octave::{Base, LEVELS, Octave, TILE_COLUMNS};
 pub use options::{FirstOctave, SiftOptions};
 use select::{Ranked, select};
 
@@ -42,11 +42,16 @@ const MIN_SIDE: usize = 12;
 /// Colours are looked up in `rgb`, or are the grey of `luma` when there is none. A photograph that is too small or
 /// without texture has no features; that is no error.
 pub fn extract(luma: &GrayImage, rgb: Option<&RgbImage>, options: &SiftOptions) -> Features {
-    extract_with(Isa::detect(), luma, rgb, options)
+    extract_with((Isa::detect(), TILE_COLUMNS), luma, rgb, options)
 }
 
-fn extract_with(isa: Isa, luma: &GrayImage, rgb: Option<&RgbImage>, options: &SiftOptions) -> Features {
-    let octaves = scale_space(isa, luma, options);
+fn extract_with(
+    (isa, tile_columns): (Isa, usize),
+    luma: &GrayImage,
+    rgb: Option<&RgbImage>,
+    options: &SiftOptions,
+) -> Features {
+    let octaves = scale_space(isa, luma, options, tile_columns);
     let blobs = strongest(&octaves, luma, options);
     let oriented = orient(isa, &octaves, &blobs, luma, options);
     let descriptors: Vec<[u8; DESCRIPTOR_LEN]> = oriented
@@ -60,21 +65,24 @@ fn extract_with(isa: Isa, luma: &GrayImage, rgb: Option<&RgbImage>, options: &Si
 }
 
 /// All octaves, finest first.
-fn scale_space(isa: Isa, luma: &GrayImage, options: &SiftOptions) -> Vec<Octave> {
-    let doubled = options.first_octave == FirstOctave::Doubled;
-    let mut octaves = Vec::new();
+fn scale_space(isa: Isa, luma: &GrayImage, options: &SiftOptions, tile_columns: usize) -> Vec<Octave> {
+    let mut octaves: Vec<Octave> = Vec::new();
     if luma.data.len() != luma.width * luma.height || luma.data.is_empty() {
         return octaves;
     }
-    let mut detector = Detector::new(255.0 * options.contrast_threshold, options.edge_threshold);
-    let mut base = Base::First(Box::new(FirstImage::new(luma, doubled, BASE_SIGMA)));
+    let thresholds = Thresholds::new(255.0 * options.contrast_threshold, options.edge_threshold);
     for _ in 0..options.num_octaves {
-        if base.size().width.min(base.size().height) < MIN_SIDE {
+        let doubled = options.first_octave == FirstOctave::Doubled;
+        let base = match octaves.last() {
+            None => Base::Photo { photo: luma, doubled },
+            Some(octave) => Base::Kept(&octave.levels[LEVELS - 1]),
+        };
+        let size = base.size();
+        if size.width.min(size.height) < MIN_SIDE {
             break;
         }
-        let (octave, next) = octave::run(isa, base, &mut detector);
+        let octave = octave::run(isa, base, &thresholds, tile_columns);
         octaves.push(octave);
-        base = next;
     }
     octaves
 }
@@ -89,7 +97,9 @@ struct Blob {
 impl Blob {
     fn place<'a>(&self, octaves: &'a [Octave]) -> Place<'a> {
         let Extremum { x, y, sigma, level, .. } = self.extremum;
-        Place { plane: &octaves[self.octave].levels[usize::from(level) - 1], x, y, sigma }
+        // Planes hold every second pixel of their octave.
+        let plane = &octaves[self.octave].levels[usize::from(level) - 1];
+        Place { plane, x: 0.5 * x, y: 0.5 * y, sigma: 0.5 * sigma }
     }
 
     /// Pixels of the photograph in one of the octave. Pixel i of an octave lies at pixel i * `step` of the photograph,

@@ -1,16 +1,23 @@
-//! One octave of the scale space, streamed row by row.
+//! One octave of the scale space, streamed row by row through tiles of columns.
 //!
 //! Six blurred images, five differences of neighbours, extrema in the middle three of these (Lowe 2004). No image of
 //! them is held whole: each level lives in a ring of as many rows as the next one's kernel and the search for extrema
-//! need. What stays is the three levels that orientations and descriptors are taken from, in 16-bit fixed point, and
-//! the first image of the next octave. Rows pass all levels while they are in the cache.
+//! need, and a tile is so narrow that all its rings stay in the second cache. Tiles overlap by what the kernels reach, so
+//! that their number changes nothing. What stays of an octave is every second pixel of the three levels that orientations
+//! and descriptors are taken from: their blur is at least two pixels of the octave, so that half of the rows and columns
+//! hold them. The third is the first image of the next octave.
 
-use super::blur::{Blur, Taps};
-use super::extrema::{Detector, Extremum};
-use super::first::FirstImage;
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::blur::{Taps, fill_margins};
+use super::extrema::{Detector, Extremum, Thresholds};
+use super::first::{FirstImage, size_of_first};
 use super::isa::Isa;
 use super::math::exp;
-use super::rows::{BLOCK, MARGIN, subtract, to_fixed};
+use super::rows::{BLOCK, MARGIN, halve, subtract};
+use crate::image::GrayImage;
 
 /// Levels in which extrema are searched, per octave (Lowe 2004).
 pub(super) const LEVELS: usize = 3;
@@ -18,6 +25,10 @@ pub(super) const LEVELS: usize = 3;
 const IMAGES: usize = LEVELS + 3;
 /// Standard deviation of each octave's first image in its own pixels (Lowe 2004).
 pub(super) const BASE_SIGMA: f64 = 1.6;
+/// Columns that a tile has at most, overlaps included: its rings take some 450 bytes a column.
+pub(super) const TILE_COLUMNS: usize = 1024;
+/// Columns by which a tile reaches over its neighbours: the sum of the kernels' radii and what the search looks at.
+const OVERLAP: usize = 48;
 
 /// Columns and rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,77 +37,113 @@ pub(super) struct Size {
     pub height: usize,
 }
 
+impl Size {
+    fn half(self) -> Self {
+        Self { width: self.width.div_ceil(2), height: self.height.div_ceil(2) }
+    }
+}
+
 /// The standard deviation of level `s` (possibly fractional) of an octave, in its pixels.
 pub(super) fn sigma_of_level(s: f64) -> f64 {
     BASE_SIGMA * exp(std::f64::consts::LN_2 * s / LEVELS as f64)
 }
 
 /// The last rows of an image that is made row by row. Rows are padded to whole blocks.
-pub(super) struct RowRing {
+pub(super) struct RowRing<T> {
     stride: usize,
     capacity: usize,
-    data: Vec<f32>,
+    data: Vec<T>,
 }
 
-impl RowRing {
+impl<T: Copy + Default> RowRing<T> {
     pub(super) fn new(width: usize, capacity: usize) -> Self {
         let stride = width.next_multiple_of(BLOCK);
-        Self { stride, capacity, data: vec![0.0; stride * capacity] }
+        Self { stride, capacity, data: vec![T::default(); stride * capacity] }
     }
 
-    pub(super) fn row(&self, y: usize) -> &[f32] {
+    pub(super) fn row(&self, y: usize) -> &[T] {
         let at = (y % self.capacity) * self.stride;
         &self.data[at..at + self.stride]
     }
 
-    pub(super) fn row_mut(&mut self, y: usize) -> &mut [f32] {
+    pub(super) fn row_mut(&mut self, y: usize) -> &mut [T] {
         let at = (y % self.capacity) * self.stride;
         &mut self.data[at..at + self.stride]
     }
 }
 
-/// A whole image in 16-bit fixed point (8 fractional bits). [`FixedPlane::SLACK`] values after the last row may be read.
-pub(super) struct FixedPlane {
+/// A whole image in fixed point; see `rows`.
+pub(super) struct Plane {
     pub size: Size,
-    pub stride: usize,
+    /// `width * height` values and [`Plane::SLACK`] behind them.
     pub data: Vec<u16>,
 }
 
-impl FixedPlane {
-    /// Values behind the last row, so that kernels may read whole blocks anywhere.
-    pub(super) const SLACK: usize = 2 * BLOCK;
+impl Plane {
+    /// Values behind the last row, so that kernels may read whole vectors anywhere.
+    pub(super) const SLACK: usize = 64;
 
     fn new(size: Size) -> Self {
-        let stride = size.width.next_multiple_of(BLOCK);
-        Self { size, stride, data: vec![0; stride * size.height + Self::SLACK] }
+        Self { size, data: vec![0; size.width * size.height + Self::SLACK] }
     }
 
-    fn row_mut(&mut self, y: usize) -> &mut [u16] {
-        &mut self.data[y * self.stride..(y + 1) * self.stride]
+    fn row(&self, y: usize) -> &[u16] {
+        &self.data[y * self.size.width..(y + 1) * self.size.width]
+    }
+
+    /// The rows of each of some ranges of columns, which follow one another.
+    fn columns_mut(&mut self, ranges: &[Range<usize>]) -> Vec<Vec<&mut [u16]>> {
+        let mut parts: Vec<Vec<&mut [u16]>> =
+            ranges.iter().map(|_| Vec::with_capacity(self.size.height)).collect();
+        let pixels = self.size.width * self.size.height;
+        for mut row in self.data[..pixels].chunks_exact_mut(self.size.width.max(1)) {
+            for (part, range) in parts.iter_mut().zip(ranges) {
+                let (mine, rest) = row.split_at_mut(range.len());
+                part.push(mine);
+                row = rest;
+            }
+        }
+        parts
     }
 }
 
 /// The first image of an octave.
+#[derive(Clone, Copy)]
 pub(super) enum Base<'a> {
-    /// Made from the photograph.
-    First(Box<FirstImage<'a>>),
-    /// Every second pixel of the octave before, rows of `size.width` values.
-    Halved(Size, Vec<f32>),
+    /// Made from the photograph, at twice its resolution or at its own.
+    Photo { photo: &'a GrayImage, doubled: bool },
+    /// Kept from the octave before.
+    Kept(&'a Plane),
 }
 
-impl Base<'_> {
+impl<'a> Base<'a> {
     pub(super) fn size(&self) -> Size {
         match self {
-            Self::First(image) => image.size(),
-            Self::Halved(size, _) => *size,
+            Self::Photo { photo, doubled } => size_of_first(photo, *doubled),
+            Self::Kept(plane) => plane.size,
         }
     }
 
-    fn row(&mut self, isa: Isa, y: usize, out: &mut [f32]) {
+    fn rows(&self, columns: &Range<usize>) -> BaseRows<'a> {
+        match *self {
+            Self::Photo { photo, doubled } => BaseRows::Photo(Box::new(FirstImage::new(photo, doubled, columns))),
+            Self::Kept(plane) => BaseRows::Kept(plane, columns.clone()),
+        }
+    }
+}
+
+/// Some columns of an octave's first image.
+enum BaseRows<'a> {
+    Photo(Box<FirstImage<'a>>),
+    Kept(&'a Plane, Range<usize>),
+}
+
+impl BaseRows<'_> {
+    fn row(&mut self, isa: Isa, y: usize, out: &mut [u16]) {
         match self {
-            Self::First(image) => image.row(isa, y, out),
-            Self::Halved(size, data) => {
-                out[..size.width].copy_from_slice(&data[y * size.width..(y + 1) * size.width])
+            Self::Photo(image) => image.row(isa, y, out),
+            Self::Kept(plane, columns) => {
+                out[..columns.len()].copy_from_slice(&plane.row(y)[columns.clone()]);
             }
         }
     }
@@ -104,84 +151,143 @@ impl Base<'_> {
 
 /// What is kept of an octave.
 pub(super) struct Octave {
-    /// Images of levels 1 to [`LEVELS`].
-    pub levels: Vec<FixedPlane>,
+    /// Every second pixel of images 1 to [`LEVELS`].
+    pub levels: Vec<Plane>,
     /// What was found in it.
     pub extrema: Vec<Extremum>,
 }
 
-/// Runs an octave. Returns it and the first image of the next one.
-pub(super) fn run(isa: Isa, mut base: Base<'_>, detector: &mut Detector) -> (Octave, Base<'static>) {
+/// Runs an octave in tiles of at most `tile_columns` columns, in parallel where threads are idle.
+pub(super) fn run(isa: Isa, base: Base<'_>, thresholds: &Thresholds, tile_columns: usize) -> Octave {
     let size = base.size();
-    let half = Size { width: size.width.div_ceil(2), height: size.height.div_ceil(2) };
-    let mut stream = Stream::new(isa, size);
-    let mut levels: Vec<FixedPlane> = (0..LEVELS).map(|_| FixedPlane::new(size)).collect();
-    let mut halved = Vec::with_capacity(half.width * half.height);
-    let mut extrema = Vec::new();
-    for step in 0..size.height + stream.delays[IMAGES - 1] + Detector::REACH {
-        if step < size.height {
-            base.row(isa, step, stream.images[0].row_mut(step));
-        }
-        for s in 1..IMAGES {
-            let Some(y) = step.checked_sub(stream.delays[s]).filter(|&y| y < size.height) else { continue };
-            stream.make_row(s, y);
-            if (1..=LEVELS).contains(&s) {
-                to_fixed(isa, stream.images[s].row(y), levels[s - 1].row_mut(y));
-            }
-            if s == LEVELS && y % 2 == 0 {
-                halved.extend(stream.images[s].row(y)[..size.width].iter().step_by(2));
-            }
-        }
-        let searched = step.checked_sub(stream.delays[IMAGES - 1] + Detector::REACH);
-        if let Some(y) = searched.filter(|&y| y >= 1 && y + 1 < size.height) {
-            detector.search_row(isa, &stream.differences, size, y, &mut extrema);
+    let tiles = tiles(size.width, tile_columns);
+    let halves: Vec<Range<usize>> =
+        tiles.iter().map(|tile| tile.core.start / 2..tile.core.end.div_ceil(2)).collect();
+    let mut levels: Vec<Plane> = (0..LEVELS).map(|_| Plane::new(size.half())).collect();
+    let mut kept: Vec<Vec<Vec<&mut [u16]>>> = tiles.iter().map(|_| Vec::with_capacity(LEVELS)).collect();
+    for level in &mut levels {
+        for (kept, part) in kept.iter_mut().zip(level.columns_mut(&halves)) {
+            kept.push(part);
         }
     }
-    (Octave { levels, extrema }, Base::Halved(half, halved))
+    let found: Vec<Vec<Extremum>> = tiles
+        .par_iter()
+        .zip(kept)
+        .map(|(tile, mut kept)| Stream::new(isa, size.height, tile).run(base, thresholds, &mut kept))
+        .collect();
+    Octave { levels, extrema: found.concat() }
 }
 
-/// The rings of an octave and how they are filled.
-struct Stream {
+/// A vertical strip of an octave.
+struct Tile {
+    /// What is computed.
+    columns: Range<usize>,
+    /// What is kept of it. Starts at an even column.
+    core: Range<usize>,
+}
+
+/// Cuts a width into tiles whose cores follow one another.
+fn tiles(width: usize, tile_columns: usize) -> Vec<Tile> {
+    let core = tile_columns.saturating_sub(2 * OVERLAP).max(2 * BLOCK);
+    let count = if width <= core + OVERLAP { 1 } else { width.div_ceil(core) };
+    let core = width.div_ceil(count).next_multiple_of(2);
+    (0..count)
+        .map(|k| (k * core).min(width)..((k + 1) * core).min(width))
+        .filter(|core| !core.is_empty())
+        .map(|core| Tile { columns: core.start.saturating_sub(OVERLAP)..(core.end + OVERLAP).min(width), core })
+        .collect()
+}
+
+/// The rings of a tile and how they are filled.
+struct Stream<'a> {
     isa: Isa,
-    size: Size,
-    blurs: Vec<Blur>,
+    height: usize,
+    tile: &'a Tile,
+    blurs: Vec<Taps>,
     /// By how many rows each image trails the first.
     delays: [usize; IMAGES],
-    images: Vec<RowRing>,
-    differences: Vec<RowRing>,
-    padded: Vec<f32>,
+    images: Vec<RowRing<u16>>,
+    differences: Vec<RowRing<i16>>,
+    padded: Vec<u16>,
 }
 
-impl Stream {
-    fn new(isa: Isa, size: Size) -> Self {
-        let blurs: Vec<Blur> = (1..IMAGES)
-            .map(|s| {
-                let (from, to) = (sigma_of_level(s as f64 - 1.0), sigma_of_level(s as f64));
-                Blur::new(Taps::gaussian((to * to - from * from).sqrt(), false))
-            })
+impl<'a> Stream<'a> {
+    fn new(isa: Isa, height: usize, tile: &'a Tile) -> Self {
+        let blurs: Vec<Taps> = (1..IMAGES)
+            .map(|s| Taps::increment(sigma_of_level(s as f64 - 1.0), sigma_of_level(s as f64)))
             .collect();
         let mut delays = [0; IMAGES];
         for s in 1..IMAGES {
-            delays[s] = delays[s - 1] + blurs[s - 1].taps.radius();
+            delays[s] = delays[s - 1] + blurs[s - 1].radius();
         }
         let last = delays[IMAGES - 1];
+        debug_assert!(last + Detector::REACH <= OVERLAP);
+        let width = tile.columns.len();
         let images = (0..IMAGES)
-            .map(|s| RowRing::new(size.width, blurs.get(s).map_or(1, |blur| 2 * blur.taps.radius() + 1)))
+            .map(|s| RowRing::new(width, blurs.get(s).map_or(1, |blur| 2 * blur.radius() + 1)))
             .collect();
         let differences = (0..IMAGES - 1)
-            .map(|s| RowRing::new(size.width, last - delays[s + 1] + 2 * Detector::REACH + 1))
+            .map(|s| RowRing::new(width, last - delays[s + 1] + 2 * Detector::REACH + 1))
             .collect();
-        let padded = vec![0.0; size.width.next_multiple_of(BLOCK) + 2 * MARGIN];
-        Self { isa, size, blurs, delays, images, differences, padded }
+        let padded = vec![0; width.next_multiple_of(BLOCK) + 2 * MARGIN];
+        Self { isa, height, tile, blurs, delays, images, differences, padded }
+    }
+
+    /// Writes every second row and column of the core of levels 1 to [`LEVELS`] to `kept`; returns the extrema.
+    fn run(mut self, base: Base<'_>, thresholds: &Thresholds, kept: &mut [Vec<&mut [u16]>]) -> Vec<Extremum> {
+        let Tile { columns, core } = self.tile;
+        let inside = core.start - columns.start..core.end - columns.start;
+        let mut base = base.rows(columns);
+        let mut detector = Detector::new(thresholds, columns.start, self.height, columns.len());
+        let mut extrema = Vec::new();
+        let last_delay = self.delays[IMAGES - 1];
+        for step in 0..self.height + last_delay + Detector::REACH {
+            if step < self.height {
+                base.row(self.isa, step, self.images[0].row_mut(step));
+            }
+            for s in 1..IMAGES {
+                let Some(y) = step.checked_sub(self.delays[s]).filter(|&y| y < self.height) else { continue };
+                self.make_row(s, y);
+                if (1..=LEVELS).contains(&s) && y % 2 == 0 {
+                    let row = &self.images[s].row(y)[inside.start..(inside.end + 1) & !1];
+                    halve(self.isa, row, kept[s - 1][y / 2]);
+                }
+            }
+            let searched = step.checked_sub(last_delay + Detector::REACH);
+            if let Some(y) = searched.filter(|&y| y >= 1 && y + 1 < self.height) {
+                detector.search_row(self.isa, &self.differences, y, &inside, &mut extrema);
+            }
+        }
+        extrema
     }
 
     /// Makes row `y` of image `s` from the image before, and of the difference of the two.
     fn make_row(&mut self, s: usize, y: usize) {
         let (before, after) = self.images.split_at_mut(s);
-        let (before, after) = (&before[s - 1], &mut after[0]);
-        let last_row = self.size.height as isize - 1;
+        let (before, after) = (&before[s - 1], after[0].row_mut(y));
+        let blur = &self.blurs[s - 1];
+        let last_row = self.height as isize - 1;
         let row = |y: isize| before.row(y.clamp(0, last_row) as usize);
-        self.blurs[s - 1].row(self.isa, (y, self.size.width), row, (&mut self.padded, after.row_mut(y)));
-        subtract(self.isa, after.row(y), before.row(y), self.differences[s - 1].row_mut(y));
+        blur.blur_rows(self.isa, y, row, &mut self.padded[MARGIN..MARGIN + after.len()]);
+        fill_margins(&mut self.padded, self.tile.columns.len());
+        blur.blur_columns(self.isa, &self.padded, after);
+        subtract(self.isa, after, before.row(y), self.differences[s - 1].row_mut(y));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cores_follow_one_another_and_start_at_even_columns() {
+        for width in [1, 2, 63, 175, 176, 177, 500, 928, 1024, 1025, 4001, 6144] {
+            for tile_columns in [1, 256, 1024] {
+                let tiles = tiles(width, tile_columns);
+                assert_eq!((tiles[0].core.start, tiles[tiles.len() - 1].core.end), (0, width));
+                assert!(tiles.windows(2).all(|pair| pair[0].core.end == pair[1].core.start));
+                assert!(tiles.iter().all(|tile| tile.core.start % 2 == 0));
+            }
+        }
     }
 }

@@ -1,151 +1,118 @@
 //! Kernels over rows of pixels: blurs, differences, extrema.
 //!
-//! Rows are padded to whole blocks of [`BLOCK`] pixels; what stands in the padding is computed like the rest and never
-//! looked at.
+//! Brightness is held in 16 bits with [`FRACTION_BITS`] fractional bits and weights as parts of 65,536. The upper half of
+//! a product is one instruction of most processors; it is rounded down, so that sums start at half a unit a tap. They
+//! can't overflow, for weights add up to one and the brightest grey leaves room. Rows are padded to whole blocks of
+//! [`BLOCK`] pixels; what stands in the padding is computed like the rest and never looked at.
 
 use super::isa::{Isa, kernel};
 
-/// Pixels that a kernel takes at once: four vectors of eight.
-pub(super) const BLOCK: usize = 32;
+pub(super) use super::weighted::BLOCK;
 
 /// Pixels in front of and behind a row that horizontal kernels may reach; more than the widest kernel's radius.
 pub(super) const MARGIN: usize = 16;
 
-/// Two rows that share a weight, as the arms of a symmetric kernel do. The middle row is a pair with itself at half
-/// its weight.
-#[derive(Clone, Copy)]
-pub(super) struct RowPair<'a> {
-    pub first: &'a [f32],
-    pub second: &'a [f32],
-    pub weight: f32,
-}
+/// The most taps of a kernel.
+pub(super) const MAX_TAPS: usize = 16;
 
-/// Two columns that share a weight, as offsets into a row that starts [`MARGIN`] pixels before its first pixel.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct ColumnPair {
-    pub first: usize,
-    pub second: usize,
-    pub weight: f32,
-}
+/// Fractional bits of brightness.
+pub(super) const FRACTION_BITS: u32 = 8;
+
+/// Fixed-point units of one grey level.
+pub(super) const UNITS_PER_GREY: f64 = (1 << FRACTION_BITS) as f64;
 
 kernel!(
-    /// Weighted sum of rows; `out` has whole blocks and the rows are at least as long.
-    blur_rows = blur_rows_body(pairs: &[RowPair<'_>], out: &mut [f32])
+    /// `out = minuend - subtrahend`. Differences of neighbouring levels never reach a fifth of the range.
+    subtract = subtract_body(minuend: &[u16], subtrahend: &[u16], out: &mut [i16])
 );
 kernel!(
-    /// Weighted sum of columns of `padded`, whose pixels start at [`MARGIN`].
-    blur_columns = blur_columns_body(padded: &[f32], pairs: &[ColumnPair], out: &mut [f32])
+    /// Every second value.
+    halve = halve_body(row: &[u16], out: &mut [u16])
 );
 kernel!(
-    /// `out = minuend - subtrahend`.
-    subtract = subtract_body(minuend: &[f32], subtrahend: &[f32], out: &mut [f32])
+    /// Puts even and odd columns together.
+    interleave = interleave_body(even: &[u16], odd: &[u16], out: &mut [u16])
 );
 kernel!(
-    /// Greys of 0 to 255 as 16-bit fixed point with 8 fractional bits, rounded to nearest even.
-    to_fixed = to_fixed_body(row: &[f32], out: &mut [u16])
+    /// Bytes as fixed point.
+    to_fixed = to_fixed_body(pixels: &[u8], out: &mut [u16])
 );
 kernel!(
-    /// The largest and smallest value of the 3 x 3 neighbourhood of each pixel but the first and the last.
-    /// `scratch` has room for two rows.
-    neighborhood = neighborhood_body(rows: [&[f32]; 3], scratch: &mut [f32], largest: &mut [f32], smallest: &mut [f32])
-);
-kernel!(
-    /// Marks pixels whose value is beyond `threshold` and not exceeded in any of three neighbourhoods.
-    mark_extrema = mark_extrema_body(row: &[f32], bounds: [(&[f32], &[f32]); 3], threshold: f32, marks: &mut [u8])
+    /// Marks the inner pixels whose value is beyond `threshold` and beyond or level with all six neighbours: those left,
+    /// right, above and below, and those in the differences before and after.
+    mark_extrema = mark_extrema_body(rows: &[&[i16]; 5], threshold: i16, marks: &mut [u8])
 );
 
 #[inline(always)]
-fn block(row: &[f32], at: usize) -> &[f32; BLOCK] {
-    row[at..].first_chunk().expect("rows are padded to whole blocks")
-}
-
-#[inline(always)]
-fn blur_rows_body(pairs: &[RowPair<'_>], out: &mut [f32]) {
-    for (index, out) in out.as_chunks_mut::<BLOCK>().0.iter_mut().enumerate() {
-        let at = index * BLOCK;
-        let mut sum = [0.0_f32; BLOCK];
-        for pair in pairs {
-            let (first, second) = (block(pair.first, at), block(pair.second, at));
-            for lane in 0..BLOCK {
-                sum[lane] = (first[lane] + second[lane]).mul_add(pair.weight, sum[lane]);
-            }
-        }
-        *out = sum;
-    }
-}
-
-#[inline(always)]
-fn blur_columns_body(padded: &[f32], pairs: &[ColumnPair], out: &mut [f32]) {
-    for (index, out) in out.as_chunks_mut::<BLOCK>().0.iter_mut().enumerate() {
-        let at = index * BLOCK;
-        let mut sum = [0.0_f32; BLOCK];
-        for pair in pairs {
-            let (first, second) = (block(padded, at + pair.first), block(padded, at + pair.second));
-            for lane in 0..BLOCK {
-                sum[lane] = (first[lane] + second[lane]).mul_add(pair.weight, sum[lane]);
-            }
-        }
-        *out = sum;
-    }
-}
-
-#[inline(always)]
-fn subtract_body(minuend: &[f32], subtrahend: &[f32], out: &mut [f32]) {
+fn subtract_body(minuend: &[u16], subtrahend: &[u16], out: &mut [i16]) {
     for ((out, a), b) in out.iter_mut().zip(minuend).zip(subtrahend) {
-        *out = a - b;
+        *out = a.wrapping_sub(*b) as i16;
     }
 }
 
 #[inline(always)]
-fn to_fixed_body(row: &[f32], out: &mut [u16]) {
-    /// Adding it leaves the value, rounded to an integer, in the low bits.
-    const MAGIC: f32 = 8_388_608.0;
-    for (out, value) in out.iter_mut().zip(row) {
-        let scaled = value.mul_add(256.0, MAGIC);
-        *out = scaled.to_bits() as u16;
+fn halve_body(row: &[u16], out: &mut [u16]) {
+    for (out, pair) in out.iter_mut().zip(row.as_chunks::<2>().0) {
+        *out = pair[0];
     }
 }
 
 #[inline(always)]
-fn larger(a: f32, b: f32) -> f32 {
-    if a > b { a } else { b }
+fn interleave_body(even: &[u16], odd: &[u16], out: &mut [u16]) {
+    for ((pair, even), odd) in out.as_chunks_mut::<2>().0.iter_mut().zip(even).zip(odd) {
+        *pair = [*even, *odd];
+    }
 }
 
 #[inline(always)]
-fn smaller(a: f32, b: f32) -> f32 {
-    if a < b { a } else { b }
+fn to_fixed_body(pixels: &[u8], out: &mut [u16]) {
+    for (out, pixel) in out.iter_mut().zip(pixels) {
+        *out = u16::from(*pixel) << FRACTION_BITS;
+    }
 }
 
 #[inline(always)]
-fn neighborhood_body(rows: [&[f32]; 3], scratch: &mut [f32], largest: &mut [f32], smallest: &mut [f32]) {
-    let width = largest.len();
-    let (tops, bottoms) = scratch.split_at_mut(width);
-    let bottoms = &mut bottoms[..width];
-    let (above, row, below) = (&rows[0][..width], &rows[1][..width], &rows[2][..width]);
-    for x in 0..width {
-        tops[x] = larger(larger(above[x], row[x]), below[x]);
-        bottoms[x] = smaller(smaller(above[x], row[x]), below[x]);
-    }
-    if width < 3 {
-        return;
-    }
-    let inner = width - 2;
-    let (largest, smallest) = (&mut largest[1..=inner], &mut smallest[1..=inner]);
+fn mark_extrema_body(rows: &[&[i16]; 5], threshold: i16, marks: &mut [u8]) {
+    let Some(inner) = marks.len().checked_sub(2).filter(|&inner| inner > 0) else { return };
+    let [above, row, below, before, after] = *rows;
+    let (left, row, right) = (&row[..inner], &row[1..=inner], &row[2..inner + 2]);
+    let (above, below) = (&above[1..=inner], &below[1..=inner]);
+    let (before, after) = (&before[1..=inner], &after[1..=inner]);
+    let marks = &mut marks[1..=inner];
     for x in 0..inner {
-        largest[x] = larger(larger(tops[x], tops[x + 1]), tops[x + 2]);
-        smallest[x] = smaller(smaller(bottoms[x], bottoms[x + 1]), bottoms[x + 2]);
+        let value = row[x];
+        let largest = left[x].max(right[x]).max(above[x].max(below[x])).max(before[x].max(after[x]));
+        let smallest = left[x].min(right[x]).min(above[x].min(below[x])).min(before[x].min(after[x]));
+        let is_top = (value >= threshold) & (value >= largest);
+        let is_bottom = (value <= -threshold) & (value <= smallest);
+        marks[x] = u8::from(is_top | is_bottom);
     }
 }
 
-#[inline(always)]
-fn mark_extrema_body(row: &[f32], bounds: [(&[f32], &[f32]); 3], threshold: f32, marks: &mut [u8]) {
-    let width = marks.len();
-    let row = &row[..width];
-    let [(max0, min0), (max1, min1), (max2, min2)] = bounds.map(|(max, min)| (&max[..width], &min[..width]));
-    for x in 0..width {
-        let value = row[x];
-        let top = (value >= threshold) & (value >= max0[x]) & (value >= max1[x]) & (value >= max2[x]);
-        let bottom = (value <= -threshold) & (value <= min0[x]) & (value <= min1[x]) & (value <= min2[x]);
-        marks[x] = u8::from(top | bottom);
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_path_gives_the_same_bits() {
+        let long: Vec<u16> = (0..8 * BLOCK).map(|k| (k.wrapping_mul(40_503).wrapping_mul(k + 7) >> 3) as u16).collect();
+        let signed: Vec<i16> = long.iter().map(|v| *v as i16).collect();
+        let bytes: Vec<u8> = long.iter().map(|v| *v as u8).collect();
+        let run = |isa: Isa| {
+            let mut differences = vec![0_i16; 4 * BLOCK];
+            subtract(isa, &long, &long[9..], &mut differences);
+            let mut marks = vec![0; 4 * BLOCK - 3];
+            mark_extrema(isa, &std::array::from_fn(|k| &signed[k * k + k..]), 200, &mut marks);
+            let mut rows = vec![vec![0; 3 * BLOCK - 1]; 3];
+            halve(isa, &long, &mut rows[0]);
+            interleave(isa, &long, &long[5..], &mut rows[1][..2 * BLOCK]);
+            to_fixed(isa, &bytes, &mut rows[2]);
+            (differences, marks, rows)
+        };
+        let oracle = run(Isa::BASELINE);
+        assert!(oracle.1.contains(&1) && oracle.1.contains(&0));
+        for isa in Isa::available() {
+            assert_eq!(run(isa), oracle, "{isa:?}");
+        }
     }
 }
