@@ -1,0 +1,234 @@
+//! The exact answer from few products: bounds reject the pairs that can't change it.
+//!
+//! 1. Each descriptor's runner-up is bounded from above by the two nearest in one cell of the other image.
+//! 2. A match is nearer than `max_ratio` times the runner-up, seen from both sides, and than `max_distance`. So a pair
+//!    whose sketches prove it farther than the smaller of its two limits is no match: of all pairs about one in a
+//!    thousand survives, and its distance is computed. It also tightens the limits.
+//! 3. The few rows and columns that may still match get their exact two nearest: pairs whose sketches prove them farther
+//!    than the bound on the runner-up are left out.
+//!
+//! All others have no match, whatever their nearest is. The answer is that of all products, bit for bit, on any path.
+
+use terrane_scene::DESCRIPTOR_LEN;
+
+use super::MatchOptions;
+use super::cells::Cells;
+use super::distance::{Measured, distances};
+use super::kernel::{MatchKernel, PackedRows};
+use super::nearest::{Best, Nearest, Neighbour};
+use super::sketch::{Code, Sketches};
+use super::sweep::{ANY_REACH, CHUNK, Limits, SweepColumns, SweepPath, SweepRows, sweep};
+
+/// Pairs of images with fewer products than this are not worth the bounds.
+const LEAST_PRODUCTS: usize = 1 << 18;
+/// When more than one pair in this many survives, bounds cost more than they save.
+const LEAST_REJECTED: usize = 12;
+
+/// What the cascade keeps of an image.
+pub(super) struct Prepared {
+    descriptors: Measured,
+    rows: PackedRows,
+    cells: Cells,
+    sketches: Sketches,
+    sweep_rows: SweepRows,
+    sweep_columns: SweepColumns,
+    least_norm: i32,
+    greatest_norm: i32,
+}
+
+/// One way to run the cascade; all give the same answer.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct CascadePaths {
+    pub(super) kernel: MatchKernel,
+    pub(super) sweep: SweepPath,
+}
+
+impl Prepared {
+    pub(super) fn new(paths: CascadePaths, descriptors: Vec<[u8; DESCRIPTOR_LEN]>) -> Self {
+        let rows = paths.kernel.pack_rows(&descriptors);
+        let sketches = Sketches::new(&descriptors);
+        let cells = Cells::new(paths.kernel, &descriptors, &rows);
+        let descriptors = Measured::new(descriptors);
+        Self {
+            rows,
+            cells,
+            sweep_rows: paths.sweep.rows(&sketches.codes),
+            sweep_columns: paths.sweep.columns(&sketches.codes),
+            sketches,
+            least_norm: descriptors.norms.iter().copied().min().unwrap_or(0),
+            greatest_norm: descriptors.norms.iter().copied().max().unwrap_or(0),
+            descriptors,
+        }
+    }
+
+    pub(super) fn descriptors(&self) -> &[[u8; DESCRIPTOR_LEN]] {
+        &self.descriptors.descriptors
+    }
+}
+
+/// Nearest neighbours as far as they matter to matches, which are as among all; others have none. `None` where bounds
+/// are of no use and all products are to be computed.
+pub(super) fn nearest(
+    paths: CascadePaths,
+    first: &Prepared,
+    second: &Prepared,
+    options: &MatchOptions,
+) -> Option<Nearest> {
+    if first.descriptors.len() * second.descriptors.len() < LEAST_PRODUCTS {
+        return None;
+    }
+    let near = second.cells.nearest(first.descriptors(), &first.rows);
+    let mut rows = Side::new(first, second, &near.rows, options)?;
+    let mut columns = Side::new(second, first, &near.columns, options)?;
+    if !options.mutual {
+        columns.limits.reach.fill(ANY_REACH);
+        columns.greatest.fill(u32::MAX);
+    }
+    let candidates = candidates(&mut rows, &mut columns)?;
+    let mut open_rows: Vec<u32> = candidates.iter().map(|&(row, _)| row).collect();
+    let mut open_columns: Vec<u32> = candidates.iter().map(|&(_, column)| column).collect();
+    if !options.mutual {
+        open_columns.clear();
+    }
+    Some(Nearest {
+        rows: settle(paths.sweep, &rows, &columns, &mut open_rows),
+        columns: settle(paths.sweep, &columns, &rows, &mut open_columns),
+    })
+}
+
+/// One image's part in a pair.
+struct Side<'a> {
+    image: &'a Prepared,
+    other: &'a Prepared,
+    options: &'a MatchOptions,
+    /// The runner-up is at most this far, squared.
+    second: Vec<u32>,
+    /// A match is at most this far, squared.
+    greatest: Vec<u32>,
+    /// `greatest` for the sweep.
+    limits: Limits,
+}
+
+impl<'a> Side<'a> {
+    fn new(
+        image: &'a Prepared,
+        other: &'a Prepared,
+        near: &[Neighbour],
+        options: &'a MatchOptions,
+    ) -> Option<Self> {
+        let second: Vec<u32> = near.iter().map(|neighbour| neighbour.second_squared).collect();
+        let base = image.sketches.bases(&other.sketches)?;
+        let limits = Limits { base, reach: vec![ANY_REACH; second.len()] };
+        let greatest = vec![u32::MAX; second.len()];
+        let mut side = Self { image, other, options, second, greatest, limits };
+        (0..side.second.len()).for_each(|at| side.limit(at));
+        Some(side)
+    }
+
+    /// Sets what follows from `second`.
+    fn limit(&mut self, at: usize) {
+        let by_ratio = match self.second[at] {
+            u32::MAX => u32::MAX,
+            second => ((self.options.max_ratio.powi(2) * f64::from(second)) as u32).saturating_add(2),
+        };
+        // The squared distance of descriptors whose unit vectors are `max_distance` apart is convex in either length.
+        let cosine = 1.0 - 0.5 * self.options.max_distance.powi(2);
+        let norm = f64::from(self.image.descriptors.norms[at]);
+        let at_length = |other: i32| {
+            let other = f64::from(other);
+            norm + other - 2.0 * cosine * (norm * other).sqrt()
+        };
+        let by_distance = at_length(self.other.least_norm).max(at_length(self.other.greatest_norm));
+        self.greatest[at] = by_ratio.min((by_distance as u32).saturating_add(2));
+        self.limits.reach[at] = self.image.sketches.reach(&self.other.sketches, self.greatest[at]);
+    }
+}
+
+/// Every pair that may be a match, among others. Tightens both sides' limits.
+fn candidates(rows: &mut Side<'_>, columns: &mut Side<'_>) -> Option<Vec<(u32, u32)>> {
+    let (num_rows, num_columns) = (rows.second.len(), columns.second.len());
+    let most = num_rows * num_columns / LEAST_REJECTED;
+    let (mut row_best, mut column_best) = (Best::new(num_rows), Best::new(num_columns));
+    let (mut survivors, mut squared) = (Vec::new(), Vec::new());
+    let (mut found, mut num_survivors) = (Vec::new(), 0);
+    for start in (0..num_columns).step_by(CHUNK) {
+        survivors.clear();
+        sweep(
+            (&rows.image.sweep_rows, &rows.limits),
+            (&columns.image.sweep_columns, &columns.limits),
+            start..num_columns.min(start + CHUNK),
+            &mut survivors,
+        );
+        num_survivors += survivors.len();
+        if num_survivors > most {
+            return None;
+        }
+        distances(&rows.image.descriptors, &columns.image.descriptors, &survivors, &mut squared);
+        for (&(row, column), &distance) in survivors.iter().zip(&squared) {
+            let (at_row, at_column) = (row as usize, column as usize);
+            if distance as u32 > rows.greatest[at_row].min(columns.greatest[at_column]) {
+                continue;
+            }
+            found.push((row, column, distance as u32));
+            row_best.offer(at_row, at_column, -distance);
+            column_best.offer(at_column, at_row, -distance);
+            tighten(rows, at_row, &row_best);
+            if rows.options.mutual {
+                tighten(columns, at_column, &column_best);
+            }
+        }
+    }
+    let is_open = |&&(row, column, distance): &&(u32, u32, u32)| {
+        distance <= rows.greatest[row as usize].min(columns.greatest[column as usize])
+    };
+    Some(found.iter().filter(is_open).map(|&(row, column, _)| (row, column)).collect())
+}
+
+/// Lowers the bound on a runner-up to that of the pairs whose distance is known.
+fn tighten(side: &mut Side<'_>, at: usize, best: &Best) {
+    let second = best.second_squared(at);
+    if second < side.second[at] {
+        side.second[at] = second;
+        side.limit(at);
+    }
+}
+
+/// The exact neighbours of some of a side's descriptors.
+fn settle(
+    path: SweepPath,
+    side: &Side<'_>,
+    others: &Side<'_>,
+    open: &mut Vec<u32>,
+) -> Vec<Neighbour> {
+    open.sort_unstable();
+    open.dedup();
+    let all: Vec<u32> = (0..others.second.len() as u32).collect();
+    let everyone: Vec<u32> = (0..side.second.len() as u32).collect();
+    let mut neighbours = Best::new(everyone.len()).neighbours(&everyone, &all);
+    let codes: Vec<Code> = open.iter().map(|&at| side.image.sketches.codes[at as usize]).collect();
+    let reach = |&at: &u32| side.image.sketches.reach(&side.other.sketches, side.second[at as usize]);
+    let limits = Limits {
+        base: open.iter().map(|&at| side.limits.base[at as usize]).collect(),
+        reach: open.iter().map(reach).collect(),
+    };
+    let other_limits = Limits { base: others.limits.base.clone(), reach: vec![ANY_REACH; all.len()] };
+    let rows = path.rows(&codes);
+    let mut best = Best::new(open.len());
+    let (mut survivors, mut squared) = (Vec::new(), Vec::new());
+    for start in (0..all.len()).step_by(CHUNK) {
+        survivors.clear();
+        let range = start..all.len().min(start + CHUNK);
+        sweep((&rows, &limits), (&others.image.sweep_columns, &other_limits), range, &mut survivors);
+        let lanes: Vec<u32> = survivors.iter().map(|&(lane, _)| lane).collect();
+        survivors.iter_mut().for_each(|(lane, _)| *lane = open[*lane as usize]);
+        distances(&side.image.descriptors, &others.image.descriptors, &survivors, &mut squared);
+        for ((&lane, &(_, other)), &distance) in lanes.iter().zip(&survivors).zip(&squared) {
+            best.offer(lane as usize, other as usize, -distance);
+        }
+    }
+    let lanes: Vec<u32> = (0..open.len() as u32).collect();
+    for (&at, neighbour) in open.iter().zip(best.neighbours(&lanes, &all)) {
+        neighbours[at as usize] = neighbour;
+    }
+    neighbours
+}

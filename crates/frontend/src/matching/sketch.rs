@@ -1,0 +1,212 @@
+//! Descriptors in 32 small numbers whose products bound the products of the descriptors.
+//!
+//! A descriptor, less a typical one, is turned by an orthonormal transform that gathers its variance: cosines over the
+//! four rows and columns of cells, sines and cosines over the eight directions (the variance of SIFT falls with these
+//! frequencies as that of images does; trained axes gain little). Of its 128 coefficients 31 are kept; the length of the
+//! rest is the 32nd number. The product of two such sketches is at least that of the descriptors (Cauchy–Schwarz on the
+//! rest), so `|a|² + |b|² − 2 sketch_a · sketch_b` is at most their squared distance. Sketches are then turned again, so
+//! that no number is much greater than the others, and rounded to a *code*; what rounding took is kept as a length, and
+//! its share in a product is bounded by Cauchy–Schwarz as well. Typical values, axes and scales decide how tight the
+//! bound is, never whether it holds.
+
+use terrane_scene::DESCRIPTOR_LEN;
+
+use super::sweep::ANY_REACH;
+
+/// Numbers of a sketch.
+pub(super) const SKETCH_LEN: usize = 32;
+
+/// A rounded sketch: entries from −64 to 63.
+pub(super) type Code = [i8; SKETCH_LEN];
+
+/// The coefficients that are kept: frequency over rows, over columns, and place among the directions' (constant, cosine
+/// and sine of one turn, of two, of three, alternation).
+const KEPT: [[usize; 3]; SKETCH_LEN - 1] = [
+    [0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 0, 3], [0, 0, 4], [0, 1, 0], [0, 1, 1], [0, 1, 2], [0, 1, 3], [0, 1, 4],
+    [0, 2, 1], [0, 2, 3], [0, 3, 1], [1, 0, 0], [1, 0, 1], [1, 0, 2], [1, 0, 3], [1, 0, 4], [1, 1, 1], [1, 1, 2],
+    [1, 1, 3], [1, 1, 4], [1, 2, 1], [1, 2, 2], [2, 0, 2], [2, 1, 1], [2, 1, 2], [2, 3, 1], [3, 0, 2], [3, 1, 2],
+    [3, 2, 2],
+];
+/// A typical RootSIFT descriptor of length 512, where its coefficients are not near zero.
+const TYPICAL: [([usize; 3], f32); 10] = [
+    ([0, 0, 0], 406.0), ([0, 0, 1], 61.0), ([0, 0, 3], 58.0), ([0, 0, 5], 15.0), ([0, 2, 0], -38.0),
+    ([0, 2, 1], -50.0), ([0, 2, 3], -19.0), ([1, 1, 2], -25.0), ([2, 0, 0], -31.0), ([2, 0, 3], -16.0),
+];
+
+/// Root mean square of the entries of codes: rarely is one beyond 64.
+const TYPICAL_ENTRY: f32 = 19.0;
+/// Least size of a code's unit in bytes: smaller ones would come near the rounding of the transform.
+const LEAST_UNIT: f32 = 0.5;
+/// Bounds the rounding of f32 in a sketch of any bytes, in units: 2⁻²⁴ · 2,885 · 25 operations over [`LEAST_UNIT`].
+const FLOAT_SLACK: f32 = 0.03;
+/// Most that a base may be lowered for rounding; see [`super::sweep`].
+const MAX_SLACK: f32 = 16_000.0;
+
+/// The sketches of one image.
+pub(super) struct Sketches {
+    pub(super) codes: Vec<Code>,
+    /// What a code's entry of one stands for, in bytes.
+    unit: f32,
+    /// Squared length of each sketch in units, as far as f32 knows: of each descriptor less the typical one.
+    squared: Vec<f32>,
+    /// Length of what rounding took from each sketch, in units, at least.
+    lost: Vec<f32>,
+    /// Greatest length of a code.
+    longest: f32,
+}
+
+impl Sketches {
+    pub(super) fn new(descriptors: &[[u8; DESCRIPTOR_LEN]]) -> Self {
+        let sketches: Vec<[f32; SKETCH_LEN]> = descriptors.iter().map(sketch).collect();
+        let squares: Vec<f32> = sketches.iter().map(squared_length).collect();
+        let mean = squares.iter().map(|&square| f64::from(square)).sum::<f64>() / squares.len().max(1) as f64;
+        let unit = ((mean / SKETCH_LEN as f64).sqrt() as f32 / TYPICAL_ENTRY).max(LEAST_UNIT);
+        let mut made = Self { codes: Vec::new(), unit, squared: Vec::new(), lost: Vec::new(), longest: 0.0 };
+        for (sketch, square) in sketches.iter().zip(squares) {
+            let (code, lost) = rounded(sketch, 1.0 / unit);
+            let length = squared_length(&code.map(f32::from)).sqrt();
+            made.longest = made.longest.max(length);
+            made.squared.push(square / (unit * unit));
+            made.lost.push(lost + FLOAT_SLACK);
+            made.codes.push(code);
+        }
+        made
+    }
+
+    /// The bases of this side's limits in a product with another image's sketches, in units of both, or `None` when
+    /// sketches have lost too much to be of use.
+    pub(super) fn bases(&self, other: &Self) -> Option<Vec<i32>> {
+        let ratio = self.unit / other.unit;
+        let base = |at: usize| {
+            // |code_a| lost_b + lost_a |code_b| + lost_a lost_b: the parts that are this side's.
+            let lost = self.lost[at];
+            let length = self.squared[at].sqrt();
+            let slack = lost * (other.longest + 0.5 * lost) + FLOAT_SLACK * (length + 1.0) * ratio + 1.0;
+            (slack < MAX_SLACK).then(|| (0.5 * self.squared[at] * ratio - slack).floor() as i32)
+        };
+        (0..self.codes.len()).map(base).collect()
+    }
+
+    /// The reach in units of both images' codes that a squared distance in bytes comes to.
+    pub(super) fn reach(&self, other: &Self, squared_distance: u32) -> i32 {
+        if squared_distance == u32::MAX {
+            return ANY_REACH;
+        }
+        let reach = squared_distance as f32 / (2.0 * self.unit * other.unit);
+        (reach * 1.000_01) as i32 + 2
+    }
+}
+
+/// The code of a sketch and the length of what rounding took.
+fn rounded(sketch: &[f32; SKETCH_LEN], per_unit: f32) -> (Code, f32) {
+    let mut turned = *sketch;
+    turn(&mut turned);
+    let mut code = [0; SKETCH_LEN];
+    let mut lost = 0.0;
+    for (entry, value) in code.iter_mut().zip(turned) {
+        let value = value * per_unit;
+        // Truncation of a positive number rounds as `floor` does, on any processor.
+        *entry = ((value + 64.5).clamp(0.0, 127.0) as i32 - 64) as i8;
+        lost += (value - f32::from(*entry)).powi(2);
+    }
+    (code, lost.sqrt() * 1.000_01)
+}
+
+/// The orthonormal Hadamard transform.
+fn turn(values: &mut [f32; SKETCH_LEN]) {
+    let mut half = 1;
+    while half < SKETCH_LEN {
+        for pair in values.chunks_exact_mut(2 * half) {
+            let (low, high) = pair.split_at_mut(half);
+            for (a, b) in low.iter_mut().zip(high) {
+                (*a, *b) = (*a + *b, *a - *b);
+            }
+        }
+        half *= 2;
+    }
+    const SCALE: f32 = 0.176_776_7;
+    values.iter_mut().for_each(|value| *value *= SCALE);
+}
+
+/// Kept coefficients and the length of the others.
+fn sketch(descriptor: &[u8; DESCRIPTOR_LEN]) -> [f32; SKETCH_LEN] {
+    let mut coefficients = transform(descriptor);
+    for ([row, column, direction], typical) in TYPICAL {
+        coefficients[row][column][direction] -= typical;
+    }
+    let mut sketch = [0.0; SKETCH_LEN];
+    for (kept, [row, column, direction]) in sketch.iter_mut().zip(KEPT) {
+        std::mem::swap(kept, &mut coefficients[row][column][direction]);
+    }
+    let rest: f32 = coefficients.as_flattened().iter().map(squared_length).sum();
+    sketch[SKETCH_LEN - 1] = rest.sqrt() * 1.000_01;
+    sketch
+}
+
+fn squared_length<const N: usize>(values: &[f32; N]) -> f32 {
+    values.iter().map(|value| value * value).sum()
+}
+
+/// Rows of the four-point cosine transform.
+const COSINES: [[f32; 4]; 4] = {
+    const A: f32 = 0.653_281_5;
+    const B: f32 = 0.270_598_05;
+    [[0.5, 0.5, 0.5, 0.5], [A, B, -B, -A], [0.5, -0.5, -0.5, 0.5], [B, -A, A, -B]]
+};
+/// Rows of the real eight-point Fourier transform.
+const TURNS: [[f32; 8]; 8] = {
+    const C: f32 = 0.353_553_4;
+    [
+        [C, C, C, C, C, C, C, C],
+        [0.5, C, 0.0, -C, -0.5, -C, 0.0, C],
+        [0.0, C, 0.5, C, 0.0, -C, -0.5, -C],
+        [0.5, 0.0, -0.5, 0.0, 0.5, 0.0, -0.5, 0.0],
+        [0.0, 0.5, 0.0, -0.5, 0.0, 0.5, 0.0, -0.5],
+        [0.5, -C, 0.0, C, -0.5, C, 0.0, -C],
+        [0.0, C, -0.5, C, 0.0, -C, 0.5, -C],
+        [C, -C, C, -C, C, -C, C, -C],
+    ]
+};
+
+/// All coefficients: by frequency over rows, over columns, over directions.
+fn transform(descriptor: &[u8; DESCRIPTOR_LEN]) -> [[[f32; 8]; 4]; 4] {
+    let cells = descriptor.as_chunks::<8>().0;
+    let mut by_direction = [[[0.0_f32; 8]; 4]; 4];
+    for (cell, bytes) in cells.iter().enumerate() {
+        let out = &mut by_direction[cell / 4][cell % 4];
+        // By columns of the matrix, so that eight sums advance side by side.
+        for (direction, byte) in bytes.iter().enumerate() {
+            let value = f32::from(*byte);
+            for frequency in 0..8 {
+                out[frequency] += TURNS[frequency][direction] * value;
+            }
+        }
+    }
+    let mut by_column = [[[0.0; 8]; 4]; 4];
+    let mut all = [[[0.0; 8]; 4]; 4];
+    for row in 0..4 {
+        for frequency in 0..4 {
+            for column in 0..4 {
+                add_scaled(
+                    &mut by_column[row][frequency],
+                    COSINES[frequency][column],
+                    &by_direction[row][column],
+                );
+            }
+        }
+    }
+    for frequency in 0..4 {
+        for row in 0..4 {
+            for column in 0..4 {
+                add_scaled(&mut all[frequency][column], COSINES[frequency][row], &by_column[row][column]);
+            }
+        }
+    }
+    all
+}
+
+fn add_scaled(sum: &mut [f32; 8], scale: f32, values: &[f32; 8]) {
+    for (sum, value) in sum.iter_mut().zip(values) {
+        *sum += scale * value;
+    }
+}

@@ -1,0 +1,232 @@
+//! AVX2: tiles of four rows by 32 columns, sums in 16 bits.
+//!
+//! A sum begins at minus the two bases. It may wrap on its way, but ends at most at 32,767; where it ends below −32,768
+//! and wraps, a pair survives that need not. So nothing is ever widened. `vpmaddubsw` wants unsigned rows, so 64 is added
+//! to each of their entries; its share, `−64 · Σ column`, is taken off at the beginning too. Two products fit: 2 · 127 · 64.
+
+use std::arch::x86_64::*;
+use std::ops::Range;
+
+use super::{CHUNK, Limits};
+use crate::matching::sketch::{Code, SKETCH_LEN};
+
+const ROWS: usize = 4;
+/// The i16 lanes of a register.
+const WIDTH: usize = 16;
+/// Registers of columns in a tile.
+const GROUP: usize = 2;
+const PAIRS: usize = SKETCH_LEN / 2;
+/// What is added to the entries of rows.
+const OFFSET: i16 = 64;
+
+/// Pairs of entries of four rows, each twice, so that one load fills a register with them.
+pub(in crate::matching) struct Rows {
+    strips: Vec<[[u32; ROWS]; PAIRS]>,
+    len: usize,
+}
+
+/// Pairs of entries of sixteen columns side by side.
+#[derive(Clone)]
+#[repr(C, align(64))]
+struct Block([[[i8; 2]; WIDTH]; PAIRS]);
+
+pub(in crate::matching) struct Columns {
+    blocks: Vec<Block>,
+    starts: Vec<[i16; WIDTH]>,
+    len: usize,
+}
+
+pub(super) fn is_available() -> bool {
+    is_x86_feature_detected!("avx2")
+}
+
+impl Rows {
+    pub(super) fn new(codes: &[Code]) -> Self {
+        let strip_of = |codes: &[Code]| {
+            let mut strip = [[0; ROWS]; PAIRS];
+            for (row, code) in codes.iter().enumerate() {
+                for (pair, entries) in code.as_chunks::<2>().0.iter().enumerate() {
+                    let [a, b] = entries.map(|entry| (i16::from(entry) + OFFSET) as u8);
+                    strip[pair][row] = u32::from_le_bytes([a, b, a, b]);
+                }
+            }
+            strip
+        };
+        Self { strips: codes.chunks(ROWS).map(strip_of).collect(), len: codes.len() }
+    }
+}
+
+impl Columns {
+    pub(super) fn new(codes: &[Code]) -> Self {
+        let num_blocks = codes.len().div_ceil(WIDTH).next_multiple_of(GROUP);
+        let mut blocks = vec![Block([[[0; 2]; WIDTH]; PAIRS]); num_blocks];
+        let mut starts = vec![[0; WIDTH]; num_blocks];
+        for (at, code) in codes.iter().enumerate() {
+            let (block, lane) = (at / WIDTH, at % WIDTH);
+            for (pair, entries) in code.as_chunks::<2>().0.iter().enumerate() {
+                blocks[block].0[pair][lane] = *entries;
+            }
+            let sum: i16 = code.iter().map(|&entry| i16::from(entry)).sum();
+            starts[block][lane] = sum.wrapping_mul(-OFFSET);
+        }
+        Self { blocks, starts, len: codes.len() }
+    }
+}
+
+/// Limits of `N` codes in 16 bits.
+struct Narrow<const N: usize> {
+    /// Only its last 16 bits count in sums that may wrap.
+    base: [i16; N],
+    minus_reach: [i16; N],
+}
+
+fn narrow<const N: usize>(limits: &Limits, block: usize) -> Narrow<N> {
+    let mut narrow = Narrow { base: [0; N], minus_reach: [i16::MAX; N] };
+    for (lane, at) in (block * N..limits.base.len()).take(N).enumerate() {
+        narrow.base[lane] = limits.base[at] as i16;
+        // Beyond 16 bits any reach will do.
+        let reach = limits.reach[at];
+        narrow.minus_reach[lane] = if reach > i32::from(i16::MAX) { i16::MIN } else { -reach as i16 };
+    }
+    narrow
+}
+
+pub(super) fn sweep(
+    (rows, row_limits): (&Rows, &Limits),
+    (columns, column_limits): (&Columns, &Limits),
+    range: Range<usize>,
+    survivors: &mut Vec<(u32, u32)>,
+) {
+    assert!(is_available(), "this path needs AVX2");
+    assert!(rows.len == row_limits.base.len() && columns.len == column_limits.base.len());
+    assert!(range.start.is_multiple_of(CHUNK) && range.end <= columns.len);
+    for start in range.clone().step_by(CHUNK) {
+        let end = range.end.min(start + CHUNK);
+        let blocks = start / WIDTH..end.div_ceil(WIDTH).next_multiple_of(GROUP);
+        let limits: Vec<_> = blocks.clone().map(|block| narrow(column_limits, block)).collect();
+        let chunk = Chunk {
+            blocks: &columns.blocks[blocks.clone()],
+            starts: &columns.starts[blocks],
+            limits: &limits,
+            start,
+        };
+        let from = survivors.len();
+        for (strip, rows) in rows.strips.iter().enumerate() {
+            let row_limits = narrow(row_limits, strip);
+            // SAFETY: the processor has AVX2 (asserted).
+            unsafe { pass(rows, &row_limits, strip * ROWS, &chunk, survivors) };
+        }
+        drop_absent(survivors, from, rows.len, end);
+    }
+}
+
+/// Drops the pairs of lanes that hold no code.
+fn drop_absent(survivors: &mut Vec<(u32, u32)>, from: usize, num_rows: usize, end: usize) {
+    let mut kept = from;
+    for at in from..survivors.len() {
+        let (row, column) = survivors[at];
+        if (row as usize) < num_rows && (column as usize) < end {
+            survivors[kept] = (row, column);
+            kept += 1;
+        }
+    }
+    survivors.truncate(kept);
+}
+
+/// Columns that stay in cache.
+struct Chunk<'a> {
+    blocks: &'a [Block],
+    starts: &'a [[i16; WIDTH]],
+    limits: &'a [Narrow<WIDTH>],
+    /// The first column.
+    start: usize,
+}
+
+/// One strip of rows against a chunk.
+#[target_feature(enable = "avx2")]
+fn pass(
+    rows: &[[u32; ROWS]; PAIRS],
+    row_limits: &Narrow<ROWS>,
+    first_row: usize,
+    chunk: &Chunk<'_>,
+    survivors: &mut Vec<(u32, u32)>,
+) {
+    let blocks = chunk.blocks.as_chunks::<GROUP>().0;
+    let starts = chunk.starts.as_chunks::<GROUP>().0;
+    let limits = chunk.limits.as_chunks::<GROUP>().0;
+    let row_base = row_limits.base.map(|value| _mm256_set1_epi16(value));
+    let row_reach = row_limits.minus_reach.map(|value| _mm256_set1_epi16(value));
+    for (at, ((blocks, starts), limits)) in blocks.iter().zip(starts).zip(limits).enumerate() {
+        let start = [
+            _mm256_sub_epi16(load(&starts[0]), load(&limits[0].base)),
+            _mm256_sub_epi16(load(&starts[1]), load(&limits[1].base)),
+        ];
+        let sums = sums(rows, blocks, row_base.map(|base| start.map(|start| _mm256_sub_epi16(start, base))));
+        let mut rejected = sums;
+        let mut all = _mm256_set1_epi16(-1);
+        for c in 0..GROUP {
+            let reach = load(&limits[c].minus_reach);
+            for r in 0..ROWS {
+                rejected[r][c] = _mm256_cmpgt_epi16(_mm256_max_epi16(row_reach[r], reach), sums[r][c]);
+                all = _mm256_and_si256(all, rejected[r][c]);
+            }
+        }
+        if _mm256_movemask_epi8(all) != -1 {
+            let first_column = chunk.start + at * GROUP * WIDTH;
+            collect(&rejected, (first_row, first_column), survivors);
+        }
+    }
+}
+
+/// Products added to where their sums begin. Rows are written out, so that all sums stay in registers.
+#[target_feature(enable = "avx2")]
+#[inline]
+fn sums(
+    rows: &[[u32; ROWS]; PAIRS],
+    blocks: &[Block; GROUP],
+    [mut sums_0, mut sums_1, mut sums_2, mut sums_3]: [[__m256i; GROUP]; ROWS],
+) -> [[__m256i; GROUP]; ROWS] {
+    for pair in 0..PAIRS {
+        let columns = [bytemuck::must_cast(blocks[0].0[pair]), bytemuck::must_cast(blocks[1].0[pair])];
+        sums_0 = add(sums_0, rows[pair][0], columns);
+        sums_1 = add(sums_1, rows[pair][1], columns);
+        sums_2 = add(sums_2, rows[pair][2], columns);
+        sums_3 = add(sums_3, rows[pair][3], columns);
+    }
+    [sums_0, sums_1, sums_2, sums_3]
+}
+
+#[target_feature(enable = "avx2")]
+#[inline]
+fn add(sums: [__m256i; GROUP], row: u32, columns: [__m256i; GROUP]) -> [__m256i; GROUP] {
+    let row = _mm256_set1_epi32(row as i32);
+    [
+        _mm256_add_epi16(sums[0], _mm256_maddubs_epi16(row, columns[0])),
+        _mm256_add_epi16(sums[1], _mm256_maddubs_epi16(row, columns[1])),
+    ]
+}
+
+#[target_feature(enable = "avx2")]
+#[inline(never)]
+fn collect(
+    rejected: &[[__m256i; GROUP]; ROWS],
+    (first_row, first_column): (usize, usize),
+    survivors: &mut Vec<(u32, u32)>,
+) {
+    for r in 0..ROWS {
+        for c in 0..GROUP {
+            let mut mask = !_mm256_movemask_epi8(rejected[r][c]) as u32 & 0x5555_5555;
+            while mask != 0 {
+                let lane = mask.trailing_zeros() as usize / 2;
+                mask &= mask - 1;
+                survivors.push(((first_row + r) as u32, (first_column + c * WIDTH + lane) as u32));
+            }
+        }
+    }
+}
+
+#[target_feature(enable = "avx2")]
+#[inline]
+fn load(words: &[i16; WIDTH]) -> __m256i {
+    bytemuck::must_cast(*words)
+}
