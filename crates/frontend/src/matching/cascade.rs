@@ -52,8 +52,8 @@ impl Prepared {
         Self {
             rows,
             cells,
-            sweep_rows: paths.sweep.rows(&sketches.codes),
-            sweep_columns: paths.sweep.columns(&sketches.codes),
+            sweep_rows: paths.sweep.rows(&sketches.coarse.codes),
+            sweep_columns: paths.sweep.columns(&sketches.fine.codes),
             sketches,
             least_norm: descriptors.norms.iter().copied().min().unwrap_or(0),
             greatest_norm: descriptors.norms.iter().copied().max().unwrap_or(0),
@@ -78,8 +78,10 @@ pub(super) fn nearest(
         return None;
     }
     let near = second.cells.nearest(first.descriptors(), &first.rows);
-    let mut rows = Side::new(first, second, &near.rows, options)?;
-    let mut columns = Side::new(second, first, &near.columns, options)?;
+    let row_bases = first.sketches.row_bases(&second.sketches)?;
+    let column_bases = second.sketches.column_bases(&first.sketches)?;
+    let mut rows = Side::new(first, second, row_bases, &near.rows, options);
+    let mut columns = Side::new(second, first, column_bases, &near.columns, options);
     if !options.mutual {
         columns.limits.reach.fill(ANY_REACH);
         columns.greatest.fill(u32::MAX);
@@ -91,8 +93,8 @@ pub(super) fn nearest(
         open_columns.clear();
     }
     Some(Nearest {
-        rows: settle(paths.sweep, &rows, &columns, &mut open_rows),
-        columns: settle(paths.sweep, &columns, &rows, &mut open_columns),
+        rows: settle(paths.sweep, &rows, &mut open_rows)?,
+        columns: settle(paths.sweep, &columns, &mut open_columns)?,
     })
 }
 
@@ -113,16 +115,16 @@ impl<'a> Side<'a> {
     fn new(
         image: &'a Prepared,
         other: &'a Prepared,
+        base: Vec<i32>,
         near: &[Neighbour],
         options: &'a MatchOptions,
-    ) -> Option<Self> {
+    ) -> Self {
         let second: Vec<u32> = near.iter().map(|neighbour| neighbour.second_squared).collect();
-        let base = image.sketches.bases(&other.sketches)?;
         let limits = Limits { base, reach: vec![ANY_REACH; second.len()] };
         let greatest = vec![u32::MAX; second.len()];
         let mut side = Self { image, other, options, second, greatest, limits };
         (0..side.second.len()).for_each(|at| side.limit(at));
-        Some(side)
+        side
     }
 
     /// Sets what follows from `second`.
@@ -194,41 +196,43 @@ fn tighten(side: &mut Side<'_>, at: usize, best: &Best) {
 }
 
 /// The exact neighbours of some of a side's descriptors.
-fn settle(
-    path: SweepPath,
-    side: &Side<'_>,
-    others: &Side<'_>,
-    open: &mut Vec<u32>,
-) -> Vec<Neighbour> {
+fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Option<Vec<Neighbour>> {
     open.sort_unstable();
     open.dedup();
-    let all: Vec<u32> = (0..others.second.len() as u32).collect();
-    let everyone: Vec<u32> = (0..side.second.len() as u32).collect();
-    let mut neighbours = Best::new(everyone.len()).neighbours(&everyone, &all);
-    let codes: Vec<Code> = open.iter().map(|&at| side.image.sketches.codes[at as usize]).collect();
-    let reach = |&at: &u32| side.image.sketches.reach(&side.other.sketches, side.second[at as usize]);
-    let limits = Limits {
-        base: open.iter().map(|&at| side.limits.base[at as usize]).collect(),
-        reach: open.iter().map(reach).collect(),
+    let (image, other) = (side.image, side.other);
+    let reach = |second: u32| image.sketches.reach(&other.sketches, second);
+    let bases = image.sketches.row_bases(&other.sketches)?;
+    let mut limits = Limits {
+        base: open.iter().map(|&at| bases[at as usize]).collect(),
+        reach: open.iter().map(|&at| reach(side.second[at as usize])).collect(),
     };
-    let other_limits = Limits { base: others.limits.base.clone(), reach: vec![ANY_REACH; all.len()] };
+    let num_others = other.descriptors.len();
+    let other_limits =
+        Limits { base: other.sketches.column_bases(&image.sketches)?, reach: vec![ANY_REACH; num_others] };
+    let codes: Vec<Code> = open.iter().map(|&at| image.sketches.coarse.codes[at as usize]).collect();
     let rows = path.rows(&codes);
     let mut best = Best::new(open.len());
-    let (mut survivors, mut squared) = (Vec::new(), Vec::new());
-    for start in (0..all.len()).step_by(CHUNK) {
+    let (mut survivors, mut lanes, mut squared) = (Vec::new(), Vec::new(), Vec::new());
+    for start in (0..num_others).step_by(CHUNK) {
         survivors.clear();
-        let range = start..all.len().min(start + CHUNK);
-        sweep((&rows, &limits), (&others.image.sweep_columns, &other_limits), range, &mut survivors);
-        let lanes: Vec<u32> = survivors.iter().map(|&(lane, _)| lane).collect();
+        let range = start..num_others.min(start + CHUNK);
+        sweep((&rows, &limits), (&other.sweep_columns, &other_limits), range, &mut survivors);
+        lanes.clear();
+        lanes.extend(survivors.iter().map(|&(lane, _)| lane as usize));
         survivors.iter_mut().for_each(|(lane, _)| *lane = open[*lane as usize]);
-        distances(&side.image.descriptors, &others.image.descriptors, &survivors, &mut squared);
-        for ((&lane, &(_, other)), &distance) in lanes.iter().zip(&survivors).zip(&squared) {
-            best.offer(lane as usize, other as usize, -distance);
+        distances(&image.descriptors, &other.descriptors, &survivors, &mut squared);
+        for ((&lane, &(_, column)), &distance) in lanes.iter().zip(&survivors).zip(&squared) {
+            best.offer(lane, column as usize, -distance);
+        }
+        for (lane, limit) in limits.reach.iter_mut().enumerate() {
+            *limit = reach(side.second[open[lane] as usize].min(best.second_squared(lane)));
         }
     }
-    let lanes: Vec<u32> = (0..open.len() as u32).collect();
-    for (&at, neighbour) in open.iter().zip(best.neighbours(&lanes, &all)) {
+    let everyone = |len: usize| (0..len as u32).collect::<Vec<_>>();
+    let mut neighbours = Best::new(image.descriptors.len()).neighbours(&everyone(image.descriptors.len()), &[]);
+    let found = best.neighbours(&everyone(open.len()), &everyone(num_others));
+    for (&at, neighbour) in open.iter().zip(found) {
         neighbours[at as usize] = neighbour;
     }
-    neighbours
+    Some(neighbours)
 }

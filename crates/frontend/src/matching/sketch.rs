@@ -16,7 +16,7 @@ use super::sweep::ANY_REACH;
 /// Numbers of a sketch.
 pub(super) const SKETCH_LEN: usize = 32;
 
-/// A rounded sketch: entries from −64 to 63.
+/// A rounded sketch: entries from −64 to 63 where it is coarse, from −127 to 127 where it is fine.
 pub(super) type Code = [i8; SKETCH_LEN];
 
 /// The coefficients that are kept: frequency over rows, over columns, and place among the directions' (constant, cosine
@@ -33,83 +33,130 @@ const TYPICAL: [([usize; 3], f32); 10] = [
     ([0, 2, 1], -50.0), ([0, 2, 3], -19.0), ([1, 1, 2], -25.0), ([2, 0, 0], -31.0), ([2, 0, 3], -16.0),
 ];
 
-/// Root mean square of the entries of codes: rarely is one beyond 64.
-const TYPICAL_ENTRY: f32 = 19.0;
-/// Least size of a code's unit in bytes: smaller ones would come near the rounding of the transform.
-const LEAST_UNIT: f32 = 0.5;
-/// Bounds the rounding of f32 in a sketch of any bytes, in units: 2⁻²⁴ · 2,885 · 25 operations over [`LEAST_UNIT`].
+/// Root mean square of the entries of coarse codes: rarely is one beyond 64.
+const TYPICAL_ENTRY: f32 = 16.0;
+/// Least size of a coarse code's unit in bytes: smaller ones would come near the rounding of the transform.
+const LEAST_UNIT: f32 = 1.0;
+/// Bounds the rounding of f32 in a sketch of any bytes, in units: 2⁻²⁴ · 2,885 · 25 operations over half a [`LEAST_UNIT`].
 const FLOAT_SLACK: f32 = 0.03;
-/// Most that a base may be lowered for rounding; see [`super::sweep`].
-const MAX_SLACK: f32 = 16_000.0;
+/// Most that a base may be lowered for rounding.
+const MAX_SLACK: f32 = (super::sweep::MAX_EXCESS / 2) as f32 - 10.0;
 
 /// The sketches of one image.
 pub(super) struct Sketches {
+    /// What rows of a sweep are made from.
+    pub(super) coarse: Codes,
+    /// What columns are made from.
+    pub(super) fine: Codes,
+    /// Squared length of each sketch in bytes, which is that of the descriptor less the typical one.
+    squared: Vec<f32>,
+}
+
+/// Sketches rounded to multiples of a unit.
+pub(super) struct Codes {
     pub(super) codes: Vec<Code>,
-    /// What a code's entry of one stands for, in bytes.
+    /// What an entry of one stands for, in bytes.
     unit: f32,
-    /// Squared length of each sketch in units, as far as f32 knows: of each descriptor less the typical one.
+    /// Squared length of each code.
     squared: Vec<f32>,
     /// Length of what rounding took from each sketch, in units, at least.
     lost: Vec<f32>,
-    /// Greatest length of a code.
-    longest: f32,
+    /// Root mean square of `lost`.
+    typical_lost: f32,
+    /// Root mean square and maximum of the lengths of codes.
+    typical_length: f32,
+    greatest_length: f32,
 }
 
 impl Sketches {
     pub(super) fn new(descriptors: &[[u8; DESCRIPTOR_LEN]]) -> Self {
-        let sketches: Vec<[f32; SKETCH_LEN]> = descriptors.iter().map(sketch).collect();
-        let squares: Vec<f32> = sketches.iter().map(squared_length).collect();
-        let mean = squares.iter().map(|&square| f64::from(square)).sum::<f64>() / squares.len().max(1) as f64;
-        let unit = ((mean / SKETCH_LEN as f64).sqrt() as f32 / TYPICAL_ENTRY).max(LEAST_UNIT);
-        let mut made = Self { codes: Vec::new(), unit, squared: Vec::new(), lost: Vec::new(), longest: 0.0 };
-        for (sketch, square) in sketches.iter().zip(squares) {
-            let (code, lost) = rounded(sketch, 1.0 / unit);
-            let length = squared_length(&code.map(f32::from)).sqrt();
-            made.longest = made.longest.max(length);
-            made.squared.push(square / (unit * unit));
-            made.lost.push(lost + FLOAT_SLACK);
-            made.codes.push(code);
+        let mut sketches: Vec<[f32; SKETCH_LEN]> = descriptors.iter().map(sketch).collect();
+        let squared: Vec<f32> = sketches.iter().map(squared_length).collect();
+        let unit = (root_mean(&squared) / (SKETCH_LEN as f32).sqrt() / TYPICAL_ENTRY).max(LEAST_UNIT);
+        sketches.iter_mut().for_each(turn);
+        Self {
+            coarse: Codes::new(&sketches, unit, -64..=63),
+            fine: Codes::new(&sketches, 0.5 * unit, -127..=127),
+            squared,
         }
-        made
     }
 
-    /// The bases of this side's limits in a product with another image's sketches, in units of both, or `None` when
-    /// sketches have lost too much to be of use.
-    pub(super) fn bases(&self, other: &Self) -> Option<Vec<i32>> {
-        let ratio = self.unit / other.unit;
-        let base = |at: usize| {
-            // |code_a| lost_b + lost_a |code_b| + lost_a lost_b: the parts that are this side's.
-            let lost = self.lost[at];
-            let length = self.squared[at].sqrt();
-            let slack = lost * (other.longest + 0.5 * lost) + FLOAT_SLACK * (length + 1.0) * ratio + 1.0;
-            (slack < MAX_SLACK).then(|| (0.5 * self.squared[at] * ratio - slack).floor() as i32)
-        };
-        (0..self.codes.len()).map(base).collect()
+    /// The bases of this image's limits where it has the rows and another image the columns, or `None` when rounding
+    /// has taken too much for bounds to be of use.
+    pub(super) fn row_bases(&self, columns: &Self) -> Option<Vec<i32>> {
+        bases(&self.squared, &self.coarse, &columns.fine)
     }
 
-    /// The reach in units of both images' codes that a squared distance in bytes comes to.
-    pub(super) fn reach(&self, other: &Self, squared_distance: u32) -> i32 {
+    /// The bases of this image's limits where it has the columns.
+    pub(super) fn column_bases(&self, rows: &Self) -> Option<Vec<i32>> {
+        bases(&self.squared, &self.fine, &rows.coarse)
+    }
+
+    /// The reach that a squared distance in bytes comes to, where this image has the rows.
+    pub(super) fn reach(&self, columns: &Self, squared_distance: u32) -> i32 {
         if squared_distance == u32::MAX {
             return ANY_REACH;
         }
-        let reach = squared_distance as f32 / (2.0 * self.unit * other.unit);
+        let reach = squared_distance as f32 / (2.0 * self.coarse.unit * columns.fine.unit);
         (reach * 1.000_01) as i32 + 2
     }
 }
 
-/// The code of a sketch and the length of what rounding took.
-fn rounded(sketch: &[f32; SKETCH_LEN], per_unit: f32) -> (Code, f32) {
-    let mut turned = *sketch;
-    turn(&mut turned);
+/// Half the squared lengths, less this side's share of what rounding may have taken from a product:
+/// `|code_a| lost_b + lost_a |code_b| + lost_a lost_b`.
+///
+/// Each product of two is split by `2xy ≤ x²/k + k y²`, with k such that equality holds where both are typical.
+fn bases(squared: &[f32], side: &Codes, other: &Codes) -> Option<Vec<i32>> {
+    let unit = side.unit * other.unit;
+    let (by_length, by_lost) =
+        (0.5 * other.typical_lost / side.typical_length, 0.5 * other.typical_length / side.typical_lost);
+    let base = |at: usize| {
+        let lost = side.lost[at];
+        // The other side's share is at least zero: where much was lost, this side bears it all.
+        let of_lost = (by_lost * lost * lost).min(lost * other.greatest_length);
+        let of_length = by_length * side.squared[at];
+        let of_floats = FLOAT_SLACK * (squared[at].sqrt() / side.unit + 1.0) * side.unit / other.unit;
+        let slack = (of_lost + of_length + 0.5 * lost * lost) * 1.000_01 + of_floats + 1.0;
+        (slack < MAX_SLACK).then(|| (0.5 * squared[at] / unit - slack).floor() as i32)
+    };
+    (0..squared.len()).map(base).collect()
+}
+
+impl Codes {
+    fn new(turned: &[[f32; SKETCH_LEN]], unit: f32, range: std::ops::RangeInclusive<i8>) -> Self {
+        let coded = turned.iter().map(|sketch| rounded(sketch, 1.0 / unit, &range));
+        let (codes, lost): (Vec<Code>, Vec<f32>) = coded.unzip();
+        let squared: Vec<f32> = codes.iter().map(|code| squared_length(&code.map(f32::from))).collect();
+        let squared_lost: Vec<f32> = lost.iter().map(|lost| lost * lost).collect();
+        Self {
+            unit,
+            typical_lost: root_mean(&squared_lost).max(1.0),
+            typical_length: root_mean(&squared).max(1.0),
+            greatest_length: squared.iter().copied().fold(0.0, f32::max).sqrt() * 1.000_01,
+            codes,
+            squared,
+            lost,
+        }
+    }
+}
+
+fn root_mean(squares: &[f32]) -> f32 {
+    let sum: f64 = squares.iter().map(|&square| f64::from(square)).sum();
+    (sum / squares.len().max(1) as f64).sqrt() as f32
+}
+
+/// The code of a turned sketch and the length of what rounding took.
+fn rounded(turned: &[f32; SKETCH_LEN], per_unit: f32, range: &std::ops::RangeInclusive<i8>) -> (Code, f32) {
+    let (least, greatest) = (f32::from(*range.start()), f32::from(*range.end()));
     let mut code = [0; SKETCH_LEN];
     let mut lost = 0.0;
     for (entry, value) in code.iter_mut().zip(turned) {
         let value = value * per_unit;
         // Truncation of a positive number rounds as `floor` does, on any processor.
-        *entry = ((value + 64.5).clamp(0.0, 127.0) as i32 - 64) as i8;
+        *entry = ((value.clamp(least, greatest) + 128.5) as i32 - 128) as i8;
         lost += (value - f32::from(*entry)).powi(2);
     }
-    (code, lost.sqrt() * 1.000_01)
+    (code, lost.sqrt() * 1.000_01 + FLOAT_SLACK)
 }
 
 /// The orthonormal Hadamard transform.

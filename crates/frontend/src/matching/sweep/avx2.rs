@@ -1,7 +1,7 @@
 //! AVX2: tiles of four rows by 32 columns, sums in 16 bits.
 //!
-//! A sum begins at minus the two bases. It may wrap on its way, but ends at most at 32,767; where it ends below −32,768
-//! and wraps, a pair survives that need not. So nothing is ever widened. `vpmaddubsw` wants unsigned rows, so 64 is added
+//! A sum begins at 8,192 less the two bases. It may wrap on its way, but ends at most at 32,767; where it ends below
+//! −32,768 and wraps, a pair survives that need not. So nothing is ever widened. `vpmaddubsw` wants unsigned rows, so 64 is added
 //! to each of their entries; its share, `−64 · Σ column`, is taken off at the beginning too. Two products fit: 2 · 127 · 64.
 
 use std::arch::x86_64::*;
@@ -18,6 +18,9 @@ const GROUP: usize = 2;
 const PAIRS: usize = SKETCH_LEN / 2;
 /// What is added to the entries of rows.
 const OFFSET: i16 = 64;
+/// What is added to every sum: most lie far below zero.
+const SHIFT: i32 = 8192;
+const _: () = assert!(SHIFT + super::MAX_EXCESS <= i16::MAX as i32);
 
 /// Pairs of entries of four rows, each twice, so that one load fills a register with them.
 pub(in crate::matching) struct Rows {
@@ -67,7 +70,7 @@ impl Columns {
                 blocks[block].0[pair][lane] = *entries;
             }
             let sum: i16 = code.iter().map(|&entry| i16::from(entry)).sum();
-            starts[block][lane] = sum.wrapping_mul(-OFFSET);
+            starts[block][lane] = sum.wrapping_mul(-OFFSET).wrapping_add(SHIFT as i16);
         }
         Self { blocks, starts, len: codes.len() }
     }
@@ -77,16 +80,15 @@ impl Columns {
 struct Narrow<const N: usize> {
     /// Only its last 16 bits count in sums that may wrap.
     base: [i16; N],
-    minus_reach: [i16; N],
+    /// The least sum that survives.
+    least: [i16; N],
 }
 
 fn narrow<const N: usize>(limits: &Limits, block: usize) -> Narrow<N> {
-    let mut narrow = Narrow { base: [0; N], minus_reach: [i16::MAX; N] };
+    let mut narrow = Narrow { base: [0; N], least: [i16::MAX; N] };
     for (lane, at) in (block * N..limits.base.len()).take(N).enumerate() {
         narrow.base[lane] = limits.base[at] as i16;
-        // Beyond 16 bits any reach will do.
-        let reach = limits.reach[at];
-        narrow.minus_reach[lane] = if reach > i32::from(i16::MAX) { i16::MIN } else { -reach as i16 };
+        narrow.least[lane] = (SHIFT - limits.reach[at]).max(i32::from(i16::MIN)) as i16;
     }
     narrow
 }
@@ -155,7 +157,7 @@ fn pass(
     let starts = chunk.starts.as_chunks::<GROUP>().0;
     let limits = chunk.limits.as_chunks::<GROUP>().0;
     let row_base = row_limits.base.map(|value| _mm256_set1_epi16(value));
-    let row_reach = row_limits.minus_reach.map(|value| _mm256_set1_epi16(value));
+    let row_reach = row_limits.least.map(|value| _mm256_set1_epi16(value));
     for (at, ((blocks, starts), limits)) in blocks.iter().zip(starts).zip(limits).enumerate() {
         let start = [
             _mm256_sub_epi16(load(&starts[0]), load(&limits[0].base)),
@@ -165,7 +167,7 @@ fn pass(
         let mut rejected = sums;
         let mut all = _mm256_set1_epi16(-1);
         for c in 0..GROUP {
-            let reach = load(&limits[c].minus_reach);
+            let reach = load(&limits[c].least);
             for r in 0..ROWS {
                 rejected[r][c] = _mm256_cmpgt_epi16(_mm256_max_epi16(row_reach[r], reach), sums[r][c]);
                 all = _mm256_and_si256(all, rejected[r][c]);

@@ -1,8 +1,8 @@
 //! Which pairs of sketches may be near: a bound on every pair of two images, at a quarter of the cost of the distances.
 //!
 //! A pair *survives* where `code_a · code_b ≥ base_a + base_b − min(reach_a, reach_b)`. The limits are set so that every
-//! pair whose squared distance is within the smaller of its two reaches survives; see `sketch`. No product exceeds its
-//! two bases by more than 32,767. Where limits or the difference leave 16 bits on the other side, a path may let more
+//! pair whose squared distance is within the smaller of its two reaches survives; see `sketch`. No product may exceed
+//! its two bases by more than [`MAX_EXCESS`]. Where limits or the difference leave 16 bits on the other side, a path may let more
 //! pairs survive than the scalar one, never fewer.
 
 #[cfg(target_arch = "x86_64")]
@@ -18,6 +18,8 @@ use super::sketch::Code;
 
 /// Columns that one call should be given: their codes, 16 KiB, stay in the first-level cache while all rows pass.
 pub(super) const CHUNK: usize = 512;
+/// Most by which a product may exceed the sum of its bases.
+pub(super) const MAX_EXCESS: i32 = 24_000;
 /// A reach beyond every bound: the pair's other side decides alone.
 pub(super) const ANY_REACH: i32 = i32::MAX;
 
