@@ -16,13 +16,16 @@ use super::cells::Cells;
 use super::distance::{Measured, distances};
 use super::kernel::{MatchKernel, PackedRows};
 use super::nearest::{Best, Nearest, Neighbour};
-use super::sketch::{Code, Sketches};
-use super::sweep::{ANY_REACH, CHUNK, Limits, SweepColumns, SweepPath, SweepRows, sweep};
+use super::sketch::{Code, LOOSE, Sketches};
+use super::sweep::{ANY_REACH, CHUNK, Limits, NO_REACH, SweepColumns, SweepPath, SweepRows, sweep};
 
 /// Pairs of images with fewer products than this are not worth the bounds.
 const LEAST_PRODUCTS: usize = 1 << 18;
 /// When more than one pair in this many survives, bounds cost more than they save.
 const LEAST_REJECTED: usize = 12;
+
+/// When more than one descriptor in this many has no useful bound, likewise.
+const LEAST_TIGHT: usize = 64;
 
 /// What the cascade keeps of an image.
 pub(super) struct Prepared {
@@ -78,13 +81,15 @@ pub(super) fn nearest(
         return None;
     }
     let near = second.cells.nearest(first.descriptors(), &first.rows);
-    let row_bases = first.sketches.row_bases(&second.sketches)?;
-    let column_bases = second.sketches.column_bases(&first.sketches)?;
+    let row_bases = first.sketches.row_bases(&second.sketches);
+    let column_bases = second.sketches.column_bases(&first.sketches);
     let mut rows = Side::new(first, second, row_bases, &near.rows, options);
     let mut columns = Side::new(second, first, column_bases, &near.columns, options);
+    if (rows.loose.len() + columns.loose.len()) * LEAST_TIGHT > first.descriptors.len() + second.descriptors.len() {
+        return None;
+    }
     if !options.mutual {
-        columns.limits.reach.fill(ANY_REACH);
-        columns.greatest.fill(u32::MAX);
+        columns.open();
     }
     let candidates = candidates(&mut rows, &mut columns)?;
     let mut open_rows: Vec<u32> = candidates.iter().map(|&(row, _)| row).collect();
@@ -93,8 +98,8 @@ pub(super) fn nearest(
         open_columns.clear();
     }
     Some(Nearest {
-        rows: settle(paths.sweep, &rows, &mut open_rows)?,
-        columns: settle(paths.sweep, &columns, &mut open_columns)?,
+        rows: settle(paths.sweep, &rows, &mut open_rows),
+        columns: settle(paths.sweep, &columns, &mut open_columns),
     })
 }
 
@@ -109,6 +114,8 @@ struct Side<'a> {
     greatest: Vec<u32>,
     /// `greatest` for the sweep.
     limits: Limits,
+    /// Those without a useful bound, left out of sweeps.
+    loose: Vec<u32>,
 }
 
 impl<'a> Side<'a> {
@@ -120,9 +127,10 @@ impl<'a> Side<'a> {
         options: &'a MatchOptions,
     ) -> Self {
         let second: Vec<u32> = near.iter().map(|neighbour| neighbour.second_squared).collect();
+        let loose = loose(&base);
         let limits = Limits { base, reach: vec![ANY_REACH; second.len()] };
         let greatest = vec![u32::MAX; second.len()];
-        let mut side = Self { image, other, options, second, greatest, limits };
+        let mut side = Self { image, other, options, second, greatest, limits, loose };
         (0..side.second.len()).for_each(|at| side.limit(at));
         side
     }
@@ -142,7 +150,38 @@ impl<'a> Side<'a> {
         };
         let by_distance = at_length(self.other.least_norm).max(at_length(self.other.greatest_norm));
         self.greatest[at] = by_ratio.min((by_distance as u32).saturating_add(2));
-        self.limits.reach[at] = self.image.sketches.reach(&self.other.sketches, self.greatest[at]);
+        self.limits.reach[at] = match self.limits.base[at] {
+            LOOSE => NO_REACH,
+            _ => self.image.sketches.reach(&self.other.sketches, self.greatest[at]),
+        };
+    }
+
+    /// Lets the other side decide alone.
+    fn open(&mut self) {
+        self.greatest.fill(u32::MAX);
+        for (reach, &base) in self.limits.reach.iter_mut().zip(&self.limits.base) {
+            *reach = if base == LOOSE { NO_REACH } else { ANY_REACH };
+        }
+    }
+}
+
+fn loose(bases: &[i32]) -> Vec<u32> {
+    (0..bases.len() as u32).filter(|&at| bases[at as usize] == LOOSE).collect()
+}
+
+/// The pairs of a range of columns that sweeps leave out: those of loose rows and of loose columns.
+fn left_out(
+    row_bases: &[i32],
+    column_bases: &[i32],
+    range: std::ops::Range<usize>,
+    pairs: &mut Vec<(u32, u32)>,
+) {
+    for row in loose(row_bases) {
+        pairs.extend(range.clone().map(|column| (row, column as u32)));
+    }
+    for column in range.filter(|&column| column_bases[column] == LOOSE) {
+        let tight = (0..row_bases.len() as u32).filter(|&row| row_bases[row as usize] != LOOSE);
+        pairs.extend(tight.map(|row| (row, column as u32)));
     }
 }
 
@@ -154,11 +193,13 @@ fn candidates(rows: &mut Side<'_>, columns: &mut Side<'_>) -> Option<Vec<(u32, u
     let (mut survivors, mut squared) = (Vec::new(), Vec::new());
     let (mut found, mut num_survivors) = (Vec::new(), 0);
     for start in (0..num_columns).step_by(CHUNK) {
+        let range = start..num_columns.min(start + CHUNK);
         survivors.clear();
+        left_out(&rows.limits.base, &columns.limits.base, range.clone(), &mut survivors);
         sweep(
             (&rows.image.sweep_rows, &rows.limits),
             (&columns.image.sweep_columns, &columns.limits),
-            start..num_columns.min(start + CHUNK),
+            range,
             &mut survivors,
         );
         num_survivors += survivors.len();
@@ -196,19 +237,22 @@ fn tighten(side: &mut Side<'_>, at: usize, best: &Best) {
 }
 
 /// The exact neighbours of some of a side's descriptors.
-fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Option<Vec<Neighbour>> {
+fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Vec<Neighbour> {
     open.sort_unstable();
     open.dedup();
     let (image, other) = (side.image, side.other);
     let reach = |second: u32| image.sketches.reach(&other.sketches, second);
-    let bases = image.sketches.row_bases(&other.sketches)?;
-    let mut limits = Limits {
-        base: open.iter().map(|&at| bases[at as usize]).collect(),
-        reach: open.iter().map(|&at| reach(side.second[at as usize])).collect(),
+    let bases = image.sketches.row_bases(&other.sketches);
+    let base: Vec<i32> = open.iter().map(|&at| bases[at as usize]).collect();
+    let reach_of = |(&at, &base): (&u32, &i32)| match base {
+        LOOSE => NO_REACH,
+        _ => reach(side.second[at as usize]),
     };
+    let mut limits = Limits { reach: open.iter().zip(&base).map(reach_of).collect(), base };
     let num_others = other.descriptors.len();
-    let other_limits =
-        Limits { base: other.sketches.column_bases(&image.sketches)?, reach: vec![ANY_REACH; num_others] };
+    let other_base = other.sketches.column_bases(&image.sketches);
+    let other_reach = |&base: &i32| if base == LOOSE { NO_REACH } else { ANY_REACH };
+    let other_limits = Limits { reach: other_base.iter().map(other_reach).collect(), base: other_base };
     let codes: Vec<Code> = open.iter().map(|&at| image.sketches.coarse.codes[at as usize]).collect();
     let rows = path.rows(&codes);
     let mut best = Best::new(open.len());
@@ -216,6 +260,7 @@ fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Option<Vec<N
     for start in (0..num_others).step_by(CHUNK) {
         survivors.clear();
         let range = start..num_others.min(start + CHUNK);
+        left_out(&limits.base, &other_limits.base, range.clone(), &mut survivors);
         sweep((&rows, &limits), (&other.sweep_columns, &other_limits), range, &mut survivors);
         lanes.clear();
         lanes.extend(survivors.iter().map(|&(lane, _)| lane as usize));
@@ -224,7 +269,7 @@ fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Option<Vec<N
         for ((&lane, &(_, column)), &distance) in lanes.iter().zip(&survivors).zip(&squared) {
             best.offer(lane, column as usize, -distance);
         }
-        for (lane, limit) in limits.reach.iter_mut().enumerate() {
+        for (lane, limit) in limits.reach.iter_mut().enumerate().filter(|(_, limit)| **limit != NO_REACH) {
             *limit = reach(side.second[open[lane] as usize].min(best.second_squared(lane)));
         }
     }
@@ -234,5 +279,5 @@ fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Option<Vec<N
     for (&at, neighbour) in open.iter().zip(found) {
         neighbours[at as usize] = neighbour;
     }
-    Some(neighbours)
+    neighbours
 }

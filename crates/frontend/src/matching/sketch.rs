@@ -34,13 +34,16 @@ const TYPICAL: [([usize; 3], f32); 10] = [
 ];
 
 /// Root mean square of the entries of coarse codes: rarely is one beyond 64.
-const TYPICAL_ENTRY: f32 = 16.0;
+const TYPICAL_ENTRY: f32 = 18.0;
 /// Least size of a coarse code's unit in bytes: smaller ones would come near the rounding of the transform.
 const LEAST_UNIT: f32 = 1.0;
 /// Bounds the rounding of f32 in a sketch of any bytes, in units: 2⁻²⁴ · 2,885 · 25 operations over half a [`LEAST_UNIT`].
 const FLOAT_SLACK: f32 = 0.03;
 /// Most that a base may be lowered for rounding.
 const MAX_SLACK: f32 = (super::sweep::MAX_EXCESS / 2) as f32 - 10.0;
+
+/// Base of a code that bounds nothing.
+pub(super) const LOOSE: i32 = i32::MAX;
 
 /// The sketches of one image.
 pub(super) struct Sketches {
@@ -81,14 +84,14 @@ impl Sketches {
         }
     }
 
-    /// The bases of this image's limits where it has the rows and another image the columns, or `None` when rounding
+    /// The bases of this image's limits where it has the rows and another image the columns; [`LOOSE`] where rounding
     /// has taken too much for bounds to be of use.
-    pub(super) fn row_bases(&self, columns: &Self) -> Option<Vec<i32>> {
+    pub(super) fn row_bases(&self, columns: &Self) -> Vec<i32> {
         bases(&self.squared, &self.coarse, &columns.fine)
     }
 
     /// The bases of this image's limits where it has the columns.
-    pub(super) fn column_bases(&self, rows: &Self) -> Option<Vec<i32>> {
+    pub(super) fn column_bases(&self, rows: &Self) -> Vec<i32> {
         bases(&self.squared, &self.fine, &rows.coarse)
     }
 
@@ -106,7 +109,7 @@ impl Sketches {
 /// `|code_a| lost_b + lost_a |code_b| + lost_a lost_b`.
 ///
 /// Each product of two is split by `2xy ≤ x²/k + k y²`, with k such that equality holds where both are typical.
-fn bases(squared: &[f32], side: &Codes, other: &Codes) -> Option<Vec<i32>> {
+fn bases(squared: &[f32], side: &Codes, other: &Codes) -> Vec<i32> {
     let unit = side.unit * other.unit;
     let (by_length, by_lost) =
         (0.5 * other.typical_lost / side.typical_length, 0.5 * other.typical_length / side.typical_lost);
@@ -117,7 +120,7 @@ fn bases(squared: &[f32], side: &Codes, other: &Codes) -> Option<Vec<i32>> {
         let of_length = by_length * side.squared[at];
         let of_floats = FLOAT_SLACK * (squared[at].sqrt() / side.unit + 1.0) * side.unit / other.unit;
         let slack = (of_lost + of_length + 0.5 * lost * lost) * 1.000_01 + of_floats + 1.0;
-        (slack < MAX_SLACK).then(|| (0.5 * squared[at] / unit - slack).floor() as i32)
+        if slack < MAX_SLACK { (0.5 * squared[at] / unit - slack).floor() as i32 } else { LOOSE }
     };
     (0..squared.len()).map(base).collect()
 }

@@ -1,6 +1,6 @@
 //! AVX2: tiles of four rows by 32 columns, sums in 16 bits.
 //!
-//! A sum begins at 8,192 less the two bases. It may wrap on its way, but ends at most at 32,767; where it ends below
+//! A sum begins at 18,700 less the two bases. It may wrap on its way, but ends at most at 32,767; where it ends below
 //! −32,768 and wraps, a pair survives that need not. So nothing is ever widened. `vpmaddubsw` wants unsigned rows, so 64 is added
 //! to each of their entries; its share, `−64 · Σ column`, is taken off at the beginning too. Two products fit: 2 · 127 · 64.
 
@@ -19,7 +19,7 @@ const PAIRS: usize = SKETCH_LEN / 2;
 /// What is added to the entries of rows.
 const OFFSET: i16 = 64;
 /// What is added to every sum: most lie far below zero.
-const SHIFT: i32 = 8192;
+const SHIFT: i32 = 18_700;
 const _: () = assert!(SHIFT + super::MAX_EXCESS <= i16::MAX as i32);
 
 /// Pairs of entries of four rows, each twice, so that one load fills a register with them.
@@ -88,7 +88,7 @@ fn narrow<const N: usize>(limits: &Limits, block: usize) -> Narrow<N> {
     let mut narrow = Narrow { base: [0; N], least: [i16::MAX; N] };
     for (lane, at) in (block * N..limits.base.len()).take(N).enumerate() {
         narrow.base[lane] = limits.base[at] as i16;
-        narrow.least[lane] = (SHIFT - limits.reach[at]).max(i32::from(i16::MIN)) as i16;
+        narrow.least[lane] = (SHIFT - limits.reach[at]).clamp(i32::from(i16::MIN), i32::from(i16::MAX)) as i16;
     }
     narrow
 }
@@ -156,28 +156,54 @@ fn pass(
     let blocks = chunk.blocks.as_chunks::<GROUP>().0;
     let starts = chunk.starts.as_chunks::<GROUP>().0;
     let limits = chunk.limits.as_chunks::<GROUP>().0;
-    let row_base = row_limits.base.map(|value| _mm256_set1_epi16(value));
-    let row_reach = row_limits.least.map(|value| _mm256_set1_epi16(value));
     for (at, ((blocks, starts), limits)) in blocks.iter().zip(starts).zip(limits).enumerate() {
         let start = [
             _mm256_sub_epi16(load(&starts[0]), load(&limits[0].base)),
             _mm256_sub_epi16(load(&starts[1]), load(&limits[1].base)),
         ];
-        let sums = sums(rows, blocks, row_base.map(|base| start.map(|start| _mm256_sub_epi16(start, base))));
-        let mut rejected = sums;
-        let mut all = _mm256_set1_epi16(-1);
-        for c in 0..GROUP {
-            let reach = load(&limits[c].least);
-            for r in 0..ROWS {
-                rejected[r][c] = _mm256_cmpgt_epi16(_mm256_max_epi16(row_reach[r], reach), sums[r][c]);
-                all = _mm256_and_si256(all, rejected[r][c]);
-            }
-        }
-        if _mm256_movemask_epi8(all) != -1 {
-            let first_column = chunk.start + at * GROUP * WIDTH;
-            collect(&rejected, (first_row, first_column), survivors);
+        let sums = sums(rows, blocks, [
+            lowered(start, row_limits.base[0]),
+            lowered(start, row_limits.base[1]),
+            lowered(start, row_limits.base[2]),
+            lowered(start, row_limits.base[3]),
+        ]);
+        let least = [load(&limits[0].least), load(&limits[1].least)];
+        let rejected = [
+            rejected(sums[0], row_limits.least[0], least),
+            rejected(sums[1], row_limits.least[1], least),
+            rejected(sums[2], row_limits.least[2], least),
+            rejected(sums[3], row_limits.least[3], least),
+        ];
+        let upper = _mm256_and_si256(rejected[0], rejected[1]);
+        let lower = _mm256_and_si256(rejected[2], rejected[3]);
+        if _mm256_movemask_epi8(_mm256_and_si256(upper, lower)) != -1 {
+            let masks = [
+                !_mm256_movemask_epi8(rejected[0]) as u32,
+                !_mm256_movemask_epi8(rejected[1]) as u32,
+                !_mm256_movemask_epi8(rejected[2]) as u32,
+                !_mm256_movemask_epi8(rejected[3]) as u32,
+            ];
+            collect(masks, (first_row, chunk.start + at * GROUP * WIDTH), survivors);
         }
     }
+}
+
+#[target_feature(enable = "avx2")]
+#[inline]
+fn lowered(start: [__m256i; GROUP], base: i16) -> [__m256i; GROUP] {
+    let base = _mm256_set1_epi16(base);
+    [_mm256_sub_epi16(start[0], base), _mm256_sub_epi16(start[1], base)]
+}
+
+/// Bytes of ones where a sum is below either side's least; eight lanes of either register in turn.
+#[target_feature(enable = "avx2")]
+#[inline]
+fn rejected(sums: [__m256i; GROUP], row_least: i16, least: [__m256i; GROUP]) -> __m256i {
+    let row_least = _mm256_set1_epi16(row_least);
+    _mm256_packs_epi16(
+        _mm256_cmpgt_epi16(_mm256_max_epi16(row_least, least[0]), sums[0]),
+        _mm256_cmpgt_epi16(_mm256_max_epi16(row_least, least[1]), sums[1]),
+    )
 }
 
 /// Products added to where their sums begin. Rows are written out, so that all sums stay in registers.
@@ -190,10 +216,11 @@ fn sums(
 ) -> [[__m256i; GROUP]; ROWS] {
     for pair in 0..PAIRS {
         let columns = [bytemuck::must_cast(blocks[0].0[pair]), bytemuck::must_cast(blocks[1].0[pair])];
-        sums_0 = add(sums_0, rows[pair][0], columns);
-        sums_1 = add(sums_1, rows[pair][1], columns);
-        sums_2 = add(sums_2, rows[pair][2], columns);
-        sums_3 = add(sums_3, rows[pair][3], columns);
+        let row = &rows[pair];
+        sums_0 = add(sums_0, row[0], columns);
+        sums_1 = add(sums_1, row[1], columns);
+        sums_2 = add(sums_2, row[2], columns);
+        sums_3 = add(sums_3, row[3], columns);
     }
     [sums_0, sums_1, sums_2, sums_3]
 }
@@ -208,21 +235,16 @@ fn add(sums: [__m256i; GROUP], row: u32, columns: [__m256i; GROUP]) -> [__m256i;
     ]
 }
 
-#[target_feature(enable = "avx2")]
-#[inline(never)]
-fn collect(
-    rejected: &[[__m256i; GROUP]; ROWS],
-    (first_row, first_column): (usize, usize),
-    survivors: &mut Vec<(u32, u32)>,
-) {
-    for r in 0..ROWS {
-        for c in 0..GROUP {
-            let mut mask = !_mm256_movemask_epi8(rejected[r][c]) as u32 & 0x5555_5555;
-            while mask != 0 {
-                let lane = mask.trailing_zeros() as usize / 2;
-                mask &= mask - 1;
-                survivors.push(((first_row + r) as u32, (first_column + c * WIDTH + lane) as u32));
-            }
+/// Appends the pairs whose bits are set.
+#[inline]
+fn collect(masks: [u32; ROWS], (first_row, first_column): (usize, usize), survivors: &mut Vec<(u32, u32)>) {
+    for (r, mut mask) in masks.into_iter().enumerate() {
+        while mask != 0 {
+            let bit = mask.trailing_zeros();
+            mask &= mask - 1;
+            // As `rejected` packs them.
+            let lane = (bit & 7) | ((bit & 8) << 1) | ((bit & 16) >> 1);
+            survivors.push(((first_row + r) as u32, first_column as u32 + lane));
         }
     }
 }

@@ -6,7 +6,7 @@
 use std::arch::x86_64::*;
 use std::ops::Range;
 
-use super::{ANY_REACH, CHUNK, Limits};
+use super::{CHUNK, Limits};
 use crate::matching::sketch::{Code, SKETCH_LEN};
 
 const ROWS: usize = 8;
@@ -83,7 +83,7 @@ fn near<const N: usize>(limits: &Limits, block: usize) -> Near<N> {
     let mut near = Near { base: [2 * FAR; N], reach: [0; N] };
     for (lane, at) in (block * N..limits.base.len()).take(N).enumerate() {
         near.base[lane] = limits.base[at].clamp(-FAR / 4, FAR / 4);
-        near.reach[lane] = if limits.reach[at] == ANY_REACH { FAR } else { limits.reach[at].min(FAR) };
+        near.reach[lane] = limits.reach[at].min(FAR);
     }
     near
 }

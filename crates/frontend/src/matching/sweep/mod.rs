@@ -19,15 +19,18 @@ use super::sketch::Code;
 /// Columns that one call should be given: their codes, 16 KiB, stay in the first-level cache while all rows pass.
 pub(super) const CHUNK: usize = 512;
 /// Most by which a product may exceed the sum of its bases.
-pub(super) const MAX_EXCESS: i32 = 24_000;
+pub(super) const MAX_EXCESS: i32 = 14_000;
 /// A reach beyond every bound: the pair's other side decides alone.
 pub(super) const ANY_REACH: i32 = i32::MAX;
+
+/// A reach that no pair is within.
+pub(super) const NO_REACH: i32 = -(1 << 26);
 
 /// The two limits of each code of a side; see the module.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Limits {
     pub(super) base: Vec<i32>,
-    /// At least 0.
+    /// At least 0, or [`NO_REACH`].
     pub(super) reach: Vec<i32>,
 }
 
