@@ -52,6 +52,9 @@ pub fn resolve(flags: &OptionFlags) -> Result<RunConfig, Failure> {
     if let Some(camera) = &flags.camera {
         config.camera = Some(camera.clone());
     }
+    if let Some(matcher) = flags.matcher {
+        config.matching.matching.matcher = matcher;
+    }
     if let Some(seed) = flags.seed {
         config.seed = seed;
     }
@@ -118,6 +121,7 @@ pub fn photographs(config: &mut RunConfig, photos: &Path) -> Result<(), Failure>
 #[cfg(test)]
 mod tests {
     use super::*;
+    use terrane_pipeline::Matcher;
 
     fn flags(set: &[&str]) -> OptionFlags {
         OptionFlags { set: set.iter().map(|&text| text.to_owned()).collect(), ..Default::default() }
@@ -139,6 +143,8 @@ mod tests {
         assert_eq!(resolve(&OptionFlags { seed: Some(9), ..flags(&["seed=7"]) }).unwrap().seed, 9);
         let sized = resolve(&OptionFlags { cluster_size: Some(50), ..Default::default() }).unwrap();
         assert_eq!(sized.partition.max_cluster_size, 50);
+        let matched = OptionFlags { matcher: Some(Matcher::Ann), ..flags(&["matching.matching.matcher=exact"]) };
+        assert_eq!(resolve(&matched).unwrap().matching.matching.matcher, Matcher::Ann);
     }
 
     #[test]

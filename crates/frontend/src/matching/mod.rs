@@ -32,6 +32,8 @@ mod sketch;
 mod sweep;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_cascade;
 
 use serde::{Deserialize, Serialize};
 use terrane_scene::{DESCRIPTOR_LEN, Features};
@@ -63,6 +65,30 @@ pub enum Matcher {
     Cascade,
     /// In a few cells, for very many features an image: some matches are missed.
     Ann,
+}
+
+impl Matcher {
+    /// Every matcher.
+    pub const ALL: [Matcher; 3] = [Matcher::Exact, Matcher::Cascade, Matcher::Ann];
+
+    /// The name in options and flags.
+    pub fn name(self) -> &'static str {
+        match self {
+            Matcher::Exact => "exact",
+            Matcher::Cascade => "cascade",
+            Matcher::Ann => "ann",
+        }
+    }
+}
+
+impl std::str::FromStr for Matcher {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        let known = || Matcher::ALL.map(Matcher::name).join(", ");
+        let found = Matcher::ALL.into_iter().find(|matcher| matcher.name() == name);
+        found.ok_or_else(|| format!("`{name}` is no matcher; known are {}", known()))
+    }
 }
 
 /// How features are matched.

@@ -71,7 +71,7 @@ pub fn cascade_paths() -> (&'static str, &'static str) {
     (paths().kernel.name(), paths().sweep.name())
 }
 
-fn paths() -> CascadePaths {
+pub(super) fn paths() -> CascadePaths {
     static PATHS: OnceLock<CascadePaths> = OnceLock::new();
     *PATHS.get_or_init(|| {
         // Cells are too small for tiles of 32 by 32.
