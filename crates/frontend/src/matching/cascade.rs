@@ -1,6 +1,6 @@
 //! The exact answer from few products: bounds reject the pairs that can't change it.
 //!
-//! 1. Each descriptor's runner-up is bounded from above by the two nearest in one cell of the other image.
+//! 1. Each descriptor's runner-up is bounded from above by the two nearest in two cells of the other image.
 //! 2. A match is nearer than `max_ratio` times the runner-up, seen from both sides, and than `max_distance`. So a pair
 //!    whose sketches prove it farther than the smaller of its two limits is no match: of all pairs about one in a
 //!    thousand survives, and its distance is computed. It also tightens the limits.
@@ -12,9 +12,9 @@
 use terrane_scene::DESCRIPTOR_LEN;
 
 use super::MatchOptions;
-use super::cells::Cells;
+use super::cells::{Cells, Image, Two, near};
 use super::distance::{Measured, distances};
-use super::kernel::{MatchKernel, PackedRows};
+use super::kernel::MatchKernel;
 use super::nearest::{Best, Nearest, Neighbour};
 use super::sketch::{Code, LOOSE, Sketches};
 use super::sweep::{ANY_REACH, CHUNK, Limits, NO_REACH, SweepColumns, SweepPath, SweepRows, sweep};
@@ -27,10 +27,12 @@ const LEAST_REJECTED: usize = 12;
 /// When more than one descriptor in this many has no useful bound, likewise.
 const LEAST_TIGHT: usize = 64;
 
+/// Cells in which each descriptor looks for a bound on its runner-up.
+const NUM_PROBES: usize = 2;
+
 /// What the cascade keeps of an image.
 pub(super) struct Prepared {
     descriptors: Measured,
-    rows: PackedRows,
     cells: Cells,
     sketches: Sketches,
     sweep_rows: SweepRows,
@@ -48,13 +50,10 @@ pub(super) struct CascadePaths {
 
 impl Prepared {
     pub(super) fn new(paths: CascadePaths, descriptors: Vec<[u8; DESCRIPTOR_LEN]>) -> Self {
-        let rows = paths.kernel.pack_rows(&descriptors);
         let sketches = Sketches::new(&descriptors);
-        let cells = Cells::new(paths.kernel, &descriptors, &rows);
         let descriptors = Measured::new(descriptors);
         Self {
-            rows,
-            cells,
+            cells: Cells::new(&sketches, paths.sweep != SweepPath::Scalar),
             sweep_rows: paths.sweep.rows(&sketches.coarse.codes),
             sweep_columns: paths.sweep.columns(&sketches.fine.codes),
             sketches,
@@ -66,6 +65,10 @@ impl Prepared {
 
     pub(super) fn descriptors(&self) -> &[[u8; DESCRIPTOR_LEN]] {
         &self.descriptors.descriptors
+    }
+
+    fn image(&self) -> Image<'_> {
+        Image { descriptors: &self.descriptors, sketches: &self.sketches, cells: &self.cells }
     }
 }
 
@@ -80,11 +83,11 @@ pub(super) fn nearest(
     if first.descriptors.len() * second.descriptors.len() < LEAST_PRODUCTS {
         return None;
     }
-    let near = second.cells.nearest(first.descriptors(), &first.rows);
+    let (near_rows, near_columns) = near(first.image(), second.image(), NUM_PROBES);
     let row_bases = first.sketches.row_bases(&second.sketches);
     let column_bases = second.sketches.column_bases(&first.sketches);
-    let mut rows = Side::new(first, second, row_bases, &near.rows, options);
-    let mut columns = Side::new(second, first, column_bases, &near.columns, options);
+    let mut rows = Side::new(first, second, row_bases, &near_rows, options);
+    let mut columns = Side::new(second, first, column_bases, &near_columns, options);
     if (rows.loose.len() + columns.loose.len()) * LEAST_TIGHT > first.descriptors.len() + second.descriptors.len() {
         return None;
     }
@@ -123,10 +126,10 @@ impl<'a> Side<'a> {
         image: &'a Prepared,
         other: &'a Prepared,
         base: Vec<i32>,
-        near: &[Neighbour],
+        near: &[Two],
         options: &'a MatchOptions,
     ) -> Self {
-        let second: Vec<u32> = near.iter().map(|neighbour| neighbour.second_squared).collect();
+        let second: Vec<u32> = near.iter().map(Two::second_squared).collect();
         let loose = loose(&base);
         let limits = Limits { base, reach: vec![ANY_REACH; second.len()] };
         let greatest = vec![u32::MAX; second.len()];

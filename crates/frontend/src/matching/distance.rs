@@ -1,5 +1,8 @@
 //! Squared distances of single pairs of descriptors: what is left to compute once bounds have rejected the rest.
 
+#[cfg(target_arch = "x86_64")]
+use std::arch::x86_64::*;
+
 use terrane_scene::DESCRIPTOR_LEN;
 
 use super::scalar;
@@ -40,6 +43,7 @@ pub(super) fn distances(
     distances: &mut Vec<i32>,
 ) {
     distances.clear();
+    distances.reserve(pairs.len());
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx2") {
         // SAFETY: the processor has AVX2.
@@ -53,18 +57,34 @@ pub(super) fn distances(
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
 fn distances_avx2(first: &Measured, second: &Measured, pairs: &[(u32, u32)], distances: &mut Vec<i32>) {
-    distances.extend(pairs.iter().map(|&(a, b)| {
+    for (at, &(a, b)) in pairs.iter().enumerate() {
+        if let Some(&(a, b)) = pairs.get(at + AHEAD) {
+            fetch(&first.descriptors[a as usize]);
+            fetch(&second.descriptors[b as usize]);
+        }
         let (a, b) = (a as usize, b as usize);
         let dot = match first.narrow[a] && second.narrow[b] {
             true => dot_narrow(&first.descriptors[a], &second.descriptors[b]),
             false => dot_wide(&first.descriptors[a], &second.descriptors[b]),
         };
-        first.norms[a] + second.norms[b] - 2 * dot
-    }));
+        distances.push(first.norms[a] + second.norms[b] - 2 * dot);
+    }
 }
 
+/// Pairs between a descriptor's fetching and its use.
 #[cfg(target_arch = "x86_64")]
-use std::arch::x86_64::*;
+const AHEAD: usize = 8;
+
+/// Asks for a descriptor to be in the first-level cache soon.
+#[cfg(target_arch = "x86_64")]
+#[inline]
+fn fetch(descriptor: &Descriptor) {
+    let (lines, _) = descriptor.as_chunks::<64>();
+    for line in lines {
+        // SAFETY: a hint, which reads nothing.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(line.as_ptr().cast()) };
+    }
+}
 
 /// Product of bytes that are all at most 127: two neighbours' products are at most 32,258.
 #[cfg(target_arch = "x86_64")]

@@ -29,7 +29,7 @@ impl PreparedImage {
                 Kind::Exact { descriptors, rows, columns }
             }
             Matcher::Cascade => Kind::Cascade(Box::new(Prepared::new(paths(), descriptors))),
-            Matcher::Ann => Kind::Ann(Box::new(ann::Prepared::new(paths().kernel, descriptors))),
+            Matcher::Ann => Kind::Ann(Box::new(ann::Prepared::new(descriptors, paths().sweep != SweepPath::Scalar))),
         })
     }
 
@@ -74,9 +74,6 @@ pub fn cascade_paths() -> (&'static str, &'static str) {
 pub(super) fn paths() -> CascadePaths {
     static PATHS: OnceLock<CascadePaths> = OnceLock::new();
     *PATHS.get_or_init(|| {
-        // Cells are too small for tiles of 32 by 32.
-        let kernels = MatchKernel::available().iter().rev();
-        let kernel = kernels.copied().find(|kernel| kernel.name() != "amx-int8");
-        CascadePaths { kernel: kernel.unwrap_or(MatchKernel::fastest()), sweep: SweepPath::fastest() }
+        CascadePaths { kernel: MatchKernel::fastest(), sweep: SweepPath::fastest() }
     })
 }

@@ -95,6 +95,12 @@ impl Sketches {
         bases(&self.squared, &self.fine, &rows.coarse)
     }
 
+    /// Half the squared length of each sketch in units of a product with another image's coarse codes, modulo 2¹⁶.
+    pub(super) fn score_bases(&self, rows: &Self) -> Vec<i16> {
+        let per_unit = 0.5 / (self.fine.unit * rows.coarse.unit);
+        self.squared.iter().map(|squared| (squared * per_unit) as i32 as i16).collect()
+    }
+
     /// The reach that a squared distance in bytes comes to, where this image has the rows.
     pub(super) fn reach(&self, columns: &Self, squared_distance: u32) -> i32 {
         if squared_distance == u32::MAX {

@@ -7,6 +7,7 @@
 use std::arch::x86_64::*;
 use std::ops::Range;
 
+use super::closest::{GUESSES, LANES, best_lanes};
 use super::{CHUNK, Limits};
 use crate::matching::sketch::{Code, SKETCH_LEN};
 
@@ -45,18 +46,19 @@ pub(super) fn is_available() -> bool {
 
 impl Rows {
     pub(super) fn new(codes: &[Code]) -> Self {
-        let strip_of = |codes: &[Code]| {
-            let mut strip = [[0; ROWS]; PAIRS];
-            for (row, code) in codes.iter().enumerate() {
-                for (pair, entries) in code.as_chunks::<2>().0.iter().enumerate() {
-                    let [a, b] = entries.map(|entry| (i16::from(entry) + OFFSET) as u8);
-                    strip[pair][row] = u32::from_le_bytes([a, b, a, b]);
-                }
-            }
-            strip
-        };
         Self { strips: codes.chunks(ROWS).map(strip_of).collect(), len: codes.len() }
     }
+}
+
+fn strip_of(codes: &[Code]) -> [[u32; ROWS]; PAIRS] {
+    let mut strip = [[0; ROWS]; PAIRS];
+    for (row, code) in codes.iter().enumerate() {
+        for (pair, entries) in code.as_chunks::<2>().0.iter().enumerate() {
+            let [a, b] = entries.map(|entry| (i16::from(entry) + OFFSET) as u8);
+            strip[pair][row] = u32::from_le_bytes([a, b, a, b]);
+        }
+    }
+    strip
 }
 
 impl Columns {
@@ -204,6 +206,48 @@ fn rejected(sums: [__m256i; GROUP], row_least: i16, least: [__m256i; GROUP]) -> 
         _mm256_cmpgt_epi16(_mm256_max_epi16(row_least, least[0]), sums[0]),
         _mm256_cmpgt_epi16(_mm256_max_epi16(row_least, least[1]), sums[1]),
     )
+}
+
+/// See [`closest`](super::closest).
+pub(super) fn closest(rows: &[Code], columns: &Columns, bases: &[i16]) -> Vec<[u32; GUESSES]> {
+    assert!(is_available(), "this path needs AVX2");
+    assert!(bases.len() == columns.len);
+    let mut starts = columns.starts.clone();
+    for (at, start) in starts.as_flattened_mut().iter_mut().enumerate() {
+        // An absent column's score is never better than none.
+        *start = bases.get(at).map_or(i16::MIN, |base| start.wrapping_sub(SHIFT as i16).wrapping_sub(*base));
+    }
+    let mut found = Vec::with_capacity(rows.len().next_multiple_of(ROWS));
+    for rows in rows.chunks(ROWS) {
+        // SAFETY: the processor has AVX2 (asserted).
+        let (best, at) = unsafe { best_of_lanes(&strip_of(rows), &columns.blocks, &starts) };
+        found.extend((0..rows.len()).map(|row| best_lanes(&best[row], &at[row])));
+    }
+    found
+}
+
+/// Of each row the best score of each lane and the group that it is from, or −1.
+#[target_feature(enable = "avx2")]
+fn best_of_lanes(
+    rows: &[[u32; ROWS]; PAIRS],
+    blocks: &[Block],
+    starts: &[[i16; WIDTH]],
+) -> ([[i16; LANES]; ROWS], [[i16; LANES]; ROWS]) {
+    let mut best = [[_mm256_set1_epi16(i16::MIN); GROUP]; ROWS];
+    let mut at = [[_mm256_set1_epi16(-1); GROUP]; ROWS];
+    let groups = blocks.as_chunks::<GROUP>().0.iter().zip(starts.as_chunks::<GROUP>().0);
+    for (group, (blocks, starts)) in groups.enumerate() {
+        let sums = sums(rows, blocks, [[load(&starts[0]), load(&starts[1])]; ROWS]);
+        let group = _mm256_set1_epi16(group as i16);
+        for r in 0..ROWS {
+            for c in 0..GROUP {
+                let better = _mm256_cmpgt_epi16(sums[r][c], best[r][c]);
+                best[r][c] = _mm256_max_epi16(sums[r][c], best[r][c]);
+                at[r][c] = _mm256_blendv_epi8(at[r][c], group, better);
+            }
+        }
+    }
+    (bytemuck::must_cast(best), bytemuck::must_cast(at))
 }
 
 /// Products added to where their sums begin. Rows are written out, so that all sums stay in registers.
