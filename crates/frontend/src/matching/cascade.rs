@@ -5,19 +5,22 @@
 //!    whose sketches prove it farther than the smaller of its two limits is no match: of all pairs about one in a
 //!    thousand survives, and its distance is computed. It also tightens the limits.
 //! 3. The few rows and columns that may still match get their exact two nearest: pairs whose sketches prove them farther
-//!    than the bound on the runner-up are left out.
+//!    than the bound on the runner-up are left out. For those that seem to match after the first step, this is part of
+//!    the second.
 //!
 //! All others have no match, whatever their nearest is. The answer is that of all products, bit for bit, on any path.
 
+use std::ops::Range;
+
 use terrane_scene::DESCRIPTOR_LEN;
 
-use super::MatchOptions;
 use super::cells::{Cells, Image, Two, near};
 use super::distance::{Measured, distances};
 use super::kernel::MatchKernel;
 use super::nearest::{Best, Nearest, Neighbour};
 use super::sketch::{Code, LOOSE, Sketches};
 use super::sweep::{ANY_REACH, CHUNK, Limits, NO_REACH, SweepColumns, SweepPath, SweepRows, sweep};
+use super::{MatchOptions, passing_ratio};
 
 /// Pairs of images with fewer products than this are not worth the bounds.
 const LEAST_PRODUCTS: usize = 1 << 18;
@@ -94,6 +97,7 @@ pub(super) fn nearest(
     if !options.mutual {
         columns.open();
     }
+    mark_likely(&mut rows, &mut columns, (&near_rows, &near_columns));
     let candidates = candidates(&mut rows, &mut columns)?;
     let mut open_rows: Vec<u32> = candidates.iter().map(|&(row, _)| row).collect();
     let mut open_columns: Vec<u32> = candidates.iter().map(|&(_, column)| column).collect();
@@ -119,6 +123,10 @@ struct Side<'a> {
     limits: Limits,
     /// Those without a useful bound, left out of sweeps.
     loose: Vec<u32>,
+    /// Which are likely to match, so that their two nearest are wanted.
+    is_likely: Vec<bool>,
+    /// Of those whose distances are known.
+    best: Best,
 }
 
 impl<'a> Side<'a> {
@@ -131,9 +139,11 @@ impl<'a> Side<'a> {
     ) -> Self {
         let second: Vec<u32> = near.iter().map(Two::second_squared).collect();
         let loose = loose(&base);
-        let limits = Limits { base, reach: vec![ANY_REACH; second.len()] };
+        let limits = Limits { reach: vec![ANY_REACH; base.len()], lone: vec![NO_REACH; base.len()], base };
         let greatest = vec![u32::MAX; second.len()];
-        let mut side = Self { image, other, options, second, greatest, limits, loose };
+        let best = Best::new(second.len());
+        let is_likely = vec![false; second.len()];
+        let mut side = Self { image, other, options, second, greatest, limits, loose, is_likely, best };
         (0..side.second.len()).for_each(|at| side.limit(at));
         side
     }
@@ -153,10 +163,20 @@ impl<'a> Side<'a> {
         };
         let by_distance = at_length(self.other.least_norm).max(at_length(self.other.greatest_norm));
         self.greatest[at] = by_ratio.min((by_distance as u32).saturating_add(2));
-        self.limits.reach[at] = match self.limits.base[at] {
-            LOOSE => NO_REACH,
-            _ => self.image.sketches.reach(&self.other.sketches, self.greatest[at]),
-        };
+        if self.limits.base[at] == LOOSE {
+            self.limits.reach[at] = NO_REACH;
+            return;
+        }
+        let reach = |squared: u32| self.image.sketches.reach(&self.other.sketches, squared);
+        self.limits.reach[at] = reach(self.greatest[at]);
+        if self.is_likely[at] {
+            self.limits.lone[at] = reach(self.second[at]);
+        }
+    }
+
+    fn mark_likely(&mut self, at: usize) {
+        self.is_likely[at] = true;
+        self.limit(at);
     }
 
     /// Lets the other side decide alone.
@@ -166,25 +186,64 @@ impl<'a> Side<'a> {
             *reach = if base == LOOSE { NO_REACH } else { ANY_REACH };
         }
     }
+
+    /// Takes a distance into account.
+    fn offer(&mut self, at: usize, other: usize, squared_distance: i32) {
+        self.best.offer(at, other, -squared_distance);
+        let second = self.best.second_squared(at);
+        if second < self.second[at] {
+            self.second[at] = second;
+            self.limit(at);
+        }
+    }
+}
+
+/// Marks what would match if those found first were the nearest.
+fn mark_likely(rows: &mut Side<'_>, columns: &mut Side<'_>, (near_rows, near_columns): (&[Two], &[Two])) {
+    let passing = |two: &Two, options: &MatchOptions| {
+        let neighbour = two.neighbour();
+        passing_ratio(&neighbour, options).and(neighbour.index)
+    };
+    for (row, two) in near_rows.iter().enumerate() {
+        let Some(column) = passing(two, rows.options) else { continue };
+        let column = column as usize;
+        if !rows.options.mutual {
+            rows.mark_likely(row);
+        } else if passing(&near_columns[column], columns.options) == Some(row as u32) {
+            rows.mark_likely(row);
+            columns.mark_likely(column);
+        }
+    }
 }
 
 fn loose(bases: &[i32]) -> Vec<u32> {
     (0..bases.len() as u32).filter(|&at| bases[at as usize] == LOOSE).collect()
 }
 
-/// The pairs of a range of columns that sweeps leave out: those of loose rows and of loose columns.
-fn left_out(
-    row_bases: &[i32],
-    column_bases: &[i32],
-    range: std::ops::Range<usize>,
+/// The pairs of a range of columns whose distances are wanted, each once: those that survive the sweep, and all of those
+/// whose row or column bounds nothing.
+fn wanted(
+    (sweep_rows, rows): (&SweepRows, &Limits),
+    (sweep_columns, columns): (&SweepColumns, &Limits),
+    range: Range<usize>,
     pairs: &mut Vec<(u32, u32)>,
 ) {
-    for row in loose(row_bases) {
+    pairs.clear();
+    sweep((sweep_rows, rows), (sweep_columns, columns), range.clone(), pairs);
+    let loose_rows = loose(&rows.base);
+    let mut loose_columns = loose(&columns.base);
+    loose_columns.retain(|&column| range.contains(&(column as usize)));
+    if loose_rows.is_empty() && loose_columns.is_empty() {
+        return;
+    }
+    let is_loose = |base: &[i32], at: u32| base[at as usize] == LOOSE;
+    pairs.retain(|&(row, column)| !is_loose(&rows.base, row) && !is_loose(&columns.base, column));
+    for row in loose_rows {
         pairs.extend(range.clone().map(|column| (row, column as u32)));
     }
-    for column in range.filter(|&column| column_bases[column] == LOOSE) {
-        let tight = (0..row_bases.len() as u32).filter(|&row| row_bases[row as usize] != LOOSE);
-        pairs.extend(tight.map(|row| (row, column as u32)));
+    for column in loose_columns {
+        let tight = (0..rows.base.len() as u32).filter(|&row| !is_loose(&rows.base, row));
+        pairs.extend(tight.map(|row| (row, column)));
     }
 }
 
@@ -192,17 +251,13 @@ fn left_out(
 fn candidates(rows: &mut Side<'_>, columns: &mut Side<'_>) -> Option<Vec<(u32, u32)>> {
     let (num_rows, num_columns) = (rows.second.len(), columns.second.len());
     let most = num_rows * num_columns / LEAST_REJECTED;
-    let (mut row_best, mut column_best) = (Best::new(num_rows), Best::new(num_columns));
     let (mut survivors, mut squared) = (Vec::new(), Vec::new());
     let (mut found, mut num_survivors) = (Vec::new(), 0);
     for start in (0..num_columns).step_by(CHUNK) {
-        let range = start..num_columns.min(start + CHUNK);
-        survivors.clear();
-        left_out(&rows.limits.base, &columns.limits.base, range.clone(), &mut survivors);
-        sweep(
+        wanted(
             (&rows.image.sweep_rows, &rows.limits),
             (&columns.image.sweep_columns, &columns.limits),
-            range,
+            start..num_columns.min(start + CHUNK),
             &mut survivors,
         );
         num_survivors += survivors.len();
@@ -212,15 +267,12 @@ fn candidates(rows: &mut Side<'_>, columns: &mut Side<'_>) -> Option<Vec<(u32, u
         distances(&rows.image.descriptors, &columns.image.descriptors, &survivors, &mut squared);
         for (&(row, column), &distance) in survivors.iter().zip(&squared) {
             let (at_row, at_column) = (row as usize, column as usize);
-            if distance as u32 > rows.greatest[at_row].min(columns.greatest[at_column]) {
-                continue;
+            if distance as u32 <= rows.greatest[at_row].min(columns.greatest[at_column]) {
+                found.push((row, column, distance as u32));
             }
-            found.push((row, column, distance as u32));
-            row_best.offer(at_row, at_column, -distance);
-            column_best.offer(at_column, at_row, -distance);
-            tighten(rows, at_row, &row_best);
+            rows.offer(at_row, at_column, distance);
             if rows.options.mutual {
-                tighten(columns, at_column, &column_best);
+                columns.offer(at_column, at_row, distance);
             }
         }
     }
@@ -230,19 +282,31 @@ fn candidates(rows: &mut Side<'_>, columns: &mut Side<'_>) -> Option<Vec<(u32, u
     Some(found.iter().filter(is_open).map(|&(row, column, _)| (row, column)).collect())
 }
 
-/// Lowers the bound on a runner-up to that of the pairs whose distance is known.
-fn tighten(side: &mut Side<'_>, at: usize, best: &Best) {
-    let second = best.second_squared(at);
-    if second < side.second[at] {
-        side.second[at] = second;
-        side.limit(at);
-    }
-}
-
 /// The exact neighbours of some of a side's descriptors.
 fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Vec<Neighbour> {
     open.sort_unstable();
     open.dedup();
+    let everyone = |len: usize| (0..len as u32).collect::<Vec<_>>();
+    let (num_own, num_others) = (side.second.len(), side.other.descriptors.len());
+    let known = side.best.neighbours(&everyone(num_own), &everyone(num_others));
+    let mut neighbours = Best::new(num_own).neighbours(&everyone(num_own), &[]);
+    for &at in open.iter().filter(|&&at| side.is_likely[at as usize]) {
+        neighbours[at as usize] = known[at as usize];
+    }
+    open.retain(|&at| !side.is_likely[at as usize]);
+    let best = all_distances(path, side, open);
+    for (&at, neighbour) in open.iter().zip(best.neighbours(&everyone(open.len()), &everyone(num_others))) {
+        neighbours[at as usize] = neighbour;
+    }
+    neighbours
+}
+
+/// The two nearest of some of a side's descriptors, which become lanes.
+fn all_distances(path: SweepPath, side: &Side<'_>, open: &[u32]) -> Best {
+    let mut best = Best::new(open.len());
+    if open.is_empty() {
+        return best;
+    }
     let (image, other) = (side.image, side.other);
     let reach = |second: u32| image.sketches.reach(&other.sketches, second);
     let bases = image.sketches.row_bases(&other.sketches);
@@ -251,20 +315,21 @@ fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Vec<Neighbou
         LOOSE => NO_REACH,
         _ => reach(side.second[at as usize]),
     };
-    let mut limits = Limits { reach: open.iter().zip(&base).map(reach_of).collect(), base };
+    let mut limits = Limits {
+        reach: vec![NO_REACH; open.len()],
+        lone: open.iter().zip(&base).map(reach_of).collect(),
+        base,
+    };
     let num_others = other.descriptors.len();
+    let alone = || vec![NO_REACH; num_others];
     let other_base = other.sketches.column_bases(&image.sketches);
-    let other_reach = |&base: &i32| if base == LOOSE { NO_REACH } else { ANY_REACH };
-    let other_limits = Limits { reach: other_base.iter().map(other_reach).collect(), base: other_base };
+    let other_limits = Limits { base: other_base, reach: alone(), lone: alone() };
     let codes: Vec<Code> = open.iter().map(|&at| image.sketches.coarse.codes[at as usize]).collect();
     let rows = path.rows(&codes);
-    let mut best = Best::new(open.len());
     let (mut survivors, mut lanes, mut squared) = (Vec::new(), Vec::new(), Vec::new());
     for start in (0..num_others).step_by(CHUNK) {
-        survivors.clear();
         let range = start..num_others.min(start + CHUNK);
-        left_out(&limits.base, &other_limits.base, range.clone(), &mut survivors);
-        sweep((&rows, &limits), (&other.sweep_columns, &other_limits), range, &mut survivors);
+        wanted((&rows, &limits), (&other.sweep_columns, &other_limits), range, &mut survivors);
         lanes.clear();
         lanes.extend(survivors.iter().map(|&(lane, _)| lane as usize));
         survivors.iter_mut().for_each(|(lane, _)| *lane = open[*lane as usize]);
@@ -272,15 +337,9 @@ fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Vec<Neighbou
         for ((&lane, &(_, column)), &distance) in lanes.iter().zip(&survivors).zip(&squared) {
             best.offer(lane, column as usize, -distance);
         }
-        for (lane, limit) in limits.reach.iter_mut().enumerate().filter(|(_, limit)| **limit != NO_REACH) {
+        for (lane, limit) in limits.lone.iter_mut().enumerate().filter(|(_, limit)| **limit != NO_REACH) {
             *limit = reach(side.second[open[lane] as usize].min(best.second_squared(lane)));
         }
     }
-    let everyone = |len: usize| (0..len as u32).collect::<Vec<_>>();
-    let mut neighbours = Best::new(image.descriptors.len()).neighbours(&everyone(image.descriptors.len()), &[]);
-    let found = best.neighbours(&everyone(open.len()), &everyone(num_others));
-    for (&at, neighbour) in open.iter().zip(found) {
-        neighbours[at as usize] = neighbour;
-    }
-    neighbours
+    best
 }

@@ -182,7 +182,8 @@ fn sweeps_agree_with_their_oracle() {
                     _ => rng.random_range(0..20_000),
                 })
                 .collect();
-            (codes, Limits { base, reach })
+            let lone = (0..count).map(|at| if at % 11 == 2 { rng.random_range(0..20_000) } else { NO_REACH });
+            (codes, Limits { base, reach, lone: lone.collect() })
         };
         let ((rows, row_limits), (columns, column_limits)) = (side(num_rows, 20), side(num_columns, 40));
         let survivors = |path: SweepPath| {

@@ -82,15 +82,22 @@ impl Columns {
 struct Narrow<const N: usize> {
     /// Only its last 16 bits count in sums that may wrap.
     base: [i16; N],
-    /// The least sum that survives.
+    /// The least sum within reach.
     least: [i16; N],
+    /// The least sum within the lone reach.
+    lone: [i16; N],
+}
+
+fn least(reach: i32) -> i16 {
+    (SHIFT - reach).clamp(i32::from(i16::MIN), i32::from(i16::MAX)) as i16
 }
 
 fn narrow<const N: usize>(limits: &Limits, block: usize) -> Narrow<N> {
-    let mut narrow = Narrow { base: [0; N], least: [i16::MAX; N] };
+    let mut narrow = Narrow { base: [0; N], least: [i16::MAX; N], lone: [i16::MAX; N] };
     for (lane, at) in (block * N..limits.base.len()).take(N).enumerate() {
         narrow.base[lane] = limits.base[at] as i16;
-        narrow.least[lane] = (SHIFT - limits.reach[at]).clamp(i32::from(i16::MIN), i32::from(i16::MAX)) as i16;
+        narrow.least[lane] = least(limits.reach[at]);
+        narrow.lone[lane] = least(limits.lone[at]);
     }
     narrow
 }
@@ -169,12 +176,11 @@ fn pass(
             lowered(start, row_limits.base[2]),
             lowered(start, row_limits.base[3]),
         ]);
-        let least = [load(&limits[0].least), load(&limits[1].least)];
         let rejected = [
-            rejected(sums[0], row_limits.least[0], least),
-            rejected(sums[1], row_limits.least[1], least),
-            rejected(sums[2], row_limits.least[2], least),
-            rejected(sums[3], row_limits.least[3], least),
+            rejected(sums[0], (row_limits.least[0], row_limits.lone[0]), limits),
+            rejected(sums[1], (row_limits.least[1], row_limits.lone[1]), limits),
+            rejected(sums[2], (row_limits.least[2], row_limits.lone[2]), limits),
+            rejected(sums[3], (row_limits.least[3], row_limits.lone[3]), limits),
         ];
         let upper = _mm256_and_si256(rejected[0], rejected[1]);
         let lower = _mm256_and_si256(rejected[2], rejected[3]);
@@ -197,15 +203,22 @@ fn lowered(start: [__m256i; GROUP], base: i16) -> [__m256i; GROUP] {
     [_mm256_sub_epi16(start[0], base), _mm256_sub_epi16(start[1], base)]
 }
 
-/// Bytes of ones where a sum is below either side's least; eight lanes of either register in turn.
+/// Bytes of ones where a sum is below what survives; eight lanes of either register in turn.
 #[target_feature(enable = "avx2")]
 #[inline]
-fn rejected(sums: [__m256i; GROUP], row_least: i16, least: [__m256i; GROUP]) -> __m256i {
-    let row_least = _mm256_set1_epi16(row_least);
-    _mm256_packs_epi16(
-        _mm256_cmpgt_epi16(_mm256_max_epi16(row_least, least[0]), sums[0]),
-        _mm256_cmpgt_epi16(_mm256_max_epi16(row_least, least[1]), sums[1]),
-    )
+fn rejected(
+    sums: [__m256i; GROUP],
+    (row_least, row_lone): (i16, i16),
+    limits: &[Narrow<WIDTH>; GROUP],
+) -> __m256i {
+    let (row_least, row_lone) = (_mm256_set1_epi16(row_least), _mm256_set1_epi16(row_lone));
+    let mut below = sums;
+    for c in 0..GROUP {
+        let least = _mm256_max_epi16(row_least, load(&limits[c].least));
+        let lone = _mm256_min_epi16(row_lone, load(&limits[c].lone));
+        below[c] = _mm256_cmpgt_epi16(_mm256_min_epi16(least, lone), sums[c]);
+    }
+    _mm256_packs_epi16(below[0], below[1])
 }
 
 /// See [`closest`](super::closest).

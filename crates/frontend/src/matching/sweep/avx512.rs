@@ -77,13 +77,15 @@ impl Columns {
 struct Near<const N: usize> {
     base: [i32; N],
     reach: [i32; N],
+    lone: [i32; N],
 }
 
 fn near<const N: usize>(limits: &Limits, block: usize) -> Near<N> {
-    let mut near = Near { base: [2 * FAR; N], reach: [0; N] };
+    let mut near = Near { base: [2 * FAR; N], reach: [0; N], lone: [0; N] };
     for (lane, at) in (block * N..limits.base.len()).take(N).enumerate() {
         near.base[lane] = limits.base[at].clamp(-FAR / 4, FAR / 4);
         near.reach[lane] = limits.reach[at].min(FAR);
+        near.lone[lane] = limits.lone[at].min(FAR);
     }
     near
 }
@@ -143,10 +145,13 @@ fn pass(
             }
         }
         let (base, reach) = (load(&chunk.limits[at].base), load(&chunk.limits[at].reach));
+        let lone = load(&chunk.limits[at].lone);
         let mut masks = [0; ROWS];
         let mut any = 0;
         for r in 0..ROWS {
             let reach = _mm512_min_epi32(reach, _mm512_set1_epi32(row_limits.reach[r]));
+            let lone = _mm512_max_epi32(lone, _mm512_set1_epi32(row_limits.lone[r]));
+            let reach = _mm512_max_epi32(reach, lone);
             let least = _mm512_sub_epi32(_mm512_add_epi32(base, _mm512_set1_epi32(row_limits.base[r])), reach);
             masks[r] = _mm512_cmpge_epi32_mask(dots[r], least);
             any |= masks[r];

@@ -1,7 +1,8 @@
 //! Which pairs of sketches may be near: a bound on every pair of two images, at a quarter of the cost of the distances.
 //!
-//! A pair *survives* where `code_a · code_b ≥ base_a + base_b − min(reach_a, reach_b)`. The limits are set so that every
-//! pair whose squared distance is within the smaller of its two reaches survives; see `sketch`. No product may exceed
+//! A pair *survives* where `code_a · code_b ≥ base_a + base_b − max(min(reach_a, reach_b), lone_a, lone_b)`. The limits
+//! are set so that every pair whose squared distance is within the smaller of its two reaches, or within a lone reach of
+//! either side, survives; see `sketch`. No product may exceed
 //! its two bases by more than [`MAX_EXCESS`]. Where limits or the difference leave 16 bits on the other side, a path may let more
 //! pairs survive than the scalar one, never fewer.
 
@@ -27,12 +28,14 @@ pub(super) const ANY_REACH: i32 = i32::MAX;
 /// A reach that no pair is within.
 pub(super) const NO_REACH: i32 = -(1 << 26);
 
-/// The two limits of each code of a side; see the module.
+/// The limits of each code of a side; see the module.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Limits {
     pub(super) base: Vec<i32>,
     /// At least 0, or [`NO_REACH`].
     pub(super) reach: Vec<i32>,
+    /// A reach that needs no consent of the other side; likewise.
+    pub(super) lone: Vec<i32>,
 }
 
 /// One way to sweep.

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::{ANY_REACH, Limits, SweepPath};
+use super::{ANY_REACH, Limits, NO_REACH, SweepPath};
 use crate::matching::sketch::{Code, SKETCH_LEN};
 
 pub(super) fn sweep(
@@ -13,7 +13,8 @@ pub(super) fn sweep(
 ) {
     for (row, a) in rows.iter().enumerate() {
         for column in range.clone() {
-            let reach = row_limits.reach[row].min(column_limits.reach[column]);
+            let lone = row_limits.lone[row].max(column_limits.lone[column]);
+            let reach = row_limits.reach[row].min(column_limits.reach[column]).max(lone);
             let least = i64::from(row_limits.base[row]) + i64::from(column_limits.base[column]);
             if reach == ANY_REACH || i64::from(dot(a, &columns[column])) >= least - i64::from(reach) {
                 survivors.push((row as u32, column as u32));
@@ -36,8 +37,9 @@ pub(super) fn is_matched_by(path: SweepPath) -> bool {
     let mut side = |count: usize, any: usize| {
         let codes: Vec<Code> = (0..count).map(|_| [(); SKETCH_LEN].map(|()| (next(61) - 30) as i8)).collect();
         let base = codes.iter().map(|code| dot(code, code) / 2).collect();
+        let lone = (0..count).map(|at| if at % 13 == any { 6000 } else { NO_REACH }).collect();
         let reach = (0..count).map(|at| if at % 11 == any { ANY_REACH } else { 5000 + next(3000) }).collect();
-        (codes, Limits { base, reach })
+        (codes, Limits { base, reach, lone })
     };
     let ((rows, row_limits), (mut columns, column_limits)) = (side(39, 3), side(75, 11));
     columns[74] = rows[38];
