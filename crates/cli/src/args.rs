@@ -4,8 +4,9 @@ use std::net::SocketAddr;
 use std::num::NonZeroU32;
 use std::path::PathBuf;
 
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use terrane_pipeline::CameraOverride;
+use terrane_pipeline::{CameraOverride, Matcher};
 
 /// Photographs in, one geo-referenced sparse reconstruction out.
 #[derive(Debug, Parser)]
@@ -69,6 +70,9 @@ pub struct OptionFlags {
     /// Words for retrieval instead of words learnt from the run: a file of descriptors, 128 bytes each.
     #[arg(long, value_name = "FILE")]
     pub vocabulary: Option<PathBuf>,
+    /// How nearest features are found: cascade gives exact's answer faster; ann misses some [default: cascade].
+    #[arg(long, value_name = "NAME", value_parser = matchers())]
+    pub matcher: Option<Matcher>,
     /// Seed of every random choice [default: 0].
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
@@ -78,6 +82,11 @@ pub struct OptionFlags {
     /// One option by its path, as mapping.max_error_px=4; may be given several times, and wins over the file.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub set: Vec<String>,
+}
+
+/// Matchers by their names, which help and refusals list.
+fn matchers() -> impl TypedValueParser<Value = Matcher> {
+    PossibleValuesParser::new(Matcher::ALL.map(Matcher::name)).try_map(|name| name.parse::<Matcher>())
 }
 
 /// Flags of `run`.
@@ -291,6 +300,7 @@ mod tests {
             format!("terrane run p -o o {camera}"),
             "terrane run p -o o --workers 2 --cluster-size 50 --memory 2GiB --seed 3 --set mapping.x=1"
                 .into(),
+            "terrane run p -o o --matcher ann".into(),
             "terrane coordinator --listen 127.0.0.1:0".into(),
             "terrane worker --coordinator http://h:1".into(),
             "terrane export o --format colmap-txt".into(),
@@ -301,6 +311,7 @@ mod tests {
         }
         for line in [
             "terrane run p",
+            "terrane run p -o o --matcher bogus",
             "terrane run p -o o --workers 0",
             "terrane run p -o o --memory x",
             "terrane run p -o o --camera FISH:1",

@@ -58,6 +58,9 @@ pub fn resolve(flags: &OptionFlags) -> Result<RunConfig, Failure> {
     if let Some(path) = &flags.vocabulary {
         set_vocabulary(&mut config, path)?;
     }
+    if let Some(matcher) = flags.matcher {
+        config.matching.matching.matcher = matcher;
+    }
     if let Some(seed) = flags.seed {
         config.seed = seed;
     }
@@ -162,6 +165,7 @@ pub fn photographs(config: &mut RunConfig, photos: &Path) -> Result<(), Failure>
 #[cfg(test)]
 mod tests {
     use super::*;
+    use terrane_pipeline::Matcher;
 
     fn flags(set: &[&str]) -> OptionFlags {
         OptionFlags { set: set.iter().map(|&text| text.to_owned()).collect(), ..Default::default() }
@@ -183,6 +187,8 @@ mod tests {
         assert_eq!(resolve(&OptionFlags { seed: Some(9), ..flags(&["seed=7"]) }).unwrap().seed, 9);
         let sized = resolve(&OptionFlags { cluster_size: Some(50), ..Default::default() }).unwrap();
         assert_eq!(sized.partition.max_cluster_size, 50);
+        let matched = OptionFlags { matcher: Some(Matcher::Ann), ..flags(&["matching.matching.matcher=exact"]) };
+        assert_eq!(resolve(&matched).unwrap().matching.matching.matcher, Matcher::Ann);
     }
 
     #[test]

@@ -80,8 +80,9 @@ impl Stage {
     /// so that no artefact of an older program is taken for today's.
     pub fn version(self) -> u32 {
         match self {
-            // Ingest: XMP, TIFF and narrow 16-bit images. Features: colours are means of 2 x 2 pixels. Pairs: footprints, ranks.
-            Stage::Ingest | Stage::Features | Stage::Pairs => 2,
+            // Ingest: XMP, TIFF and narrow 16-bit images. Features: colours are means of 2 x 2 pixels. Pairs: footprints,
+            // ranks. Match: cascade, single-precision screening.
+            Stage::Ingest | Stage::Features | Stage::Pairs | Stage::Match => 2,
             _ => 1,
         }
     }

@@ -10,48 +10,63 @@ use std::arch::x86_64::*;
 use terrane_scene::DESCRIPTOR_LEN;
 
 use super::nearest::{Best, Nearest};
-use super::pack::{Block, Packed, QUADS, Side};
+use super::pack::{Block, Form, Lanes, Packed, QUADS};
 
 /// Rows of a tile.
-const ROWS: usize = 4;
+pub(super) const ROWS: usize = 4;
 /// Columns of a block: the i32 lanes of a register.
-const WIDTH: usize = 8;
+pub(super) const WIDTH: usize = 8;
 /// Blocks of columns in a tile.
-const GROUP: usize = 2;
+pub(super) const GROUP: usize = 2;
 /// Blocks of columns that stay in the first-level cache while all rows pass: 16 KiB.
 const CACHED_BLOCKS: usize = 16;
 
-type Tile = [[__m256i; GROUP]; ROWS];
+pub(super) type Tile = [[__m256i; GROUP]; ROWS];
+
+/// Rows of this path.
+pub(super) type Rows = Packed<ROWS>;
+/// Columns of this path.
+pub(super) type Columns = Packed<WIDTH>;
 
 /// Whether this processor can run this path.
 pub(super) fn is_available() -> bool {
     is_x86_feature_detected!("avx2")
 }
 
-/// Nearest neighbours in both directions. Falls back to the scalar path where AVX2 is missing.
-pub(super) fn nearest(first: &[[u8; DESCRIPTOR_LEN]], second: &[[u8; DESCRIPTOR_LEN]]) -> Nearest {
-    if !is_available() {
-        return super::scalar::nearest(first, second);
-    }
-    let rows = Packed::new(first, Side::Rows, 1);
-    let columns = Packed::new(second, Side::Columns, GROUP);
+/// Lays out the first side.
+pub(super) fn rows(descriptors: &[[u8; DESCRIPTOR_LEN]]) -> Rows {
+    Packed::new(descriptors, Form::Unsigned, 1)
+}
+
+/// Lays out the second side.
+pub(super) fn columns(descriptors: &[[u8; DESCRIPTOR_LEN]]) -> Columns {
+    Packed::new(descriptors, Form::Signed, GROUP)
+}
+
+/// Nearest neighbours in both directions.
+///
+/// # Panics
+/// On a processor without AVX2.
+pub(super) fn nearest(rows: &Rows, columns: &Columns) -> Nearest {
+    assert!(is_available(), "this path needs AVX2");
     let mut state =
         State { row_best: Best::new(rows.num_lanes()), column_best: Best::new(columns.num_lanes()) };
     // SAFETY: the processor has AVX2, as `is_available` has just found.
-    unsafe { sweep(&rows, &columns, &mut state) };
+    unsafe { sweep(rows, columns, &mut state) };
     Nearest {
         rows: state.row_best.neighbours(&rows.order, &columns.order),
         columns: state.column_best.neighbours(&columns.order, &rows.order),
     }
 }
 
-struct State {
-    row_best: Best,
-    column_best: Best,
+/// The best so far of both sides.
+pub(super) struct State {
+    pub(super) row_best: Best,
+    pub(super) column_best: Best,
 }
 
 #[target_feature(enable = "avx2")]
-fn sweep(rows: &Packed<ROWS>, columns: &Packed<WIDTH>, state: &mut State) {
+fn sweep(rows: &Rows, columns: &Columns, state: &mut State) {
     for cached in (0..columns.blocks.len()).step_by(CACHED_BLOCKS) {
         let end = (cached + CACHED_BLOCKS).min(columns.blocks.len());
         for strip in 0..rows.blocks.len() {
@@ -64,7 +79,7 @@ fn sweep(rows: &Packed<ROWS>, columns: &Packed<WIDTH>, state: &mut State) {
 
 #[target_feature(enable = "avx2")]
 #[inline]
-fn tile(rows: &Packed<ROWS>, columns: &Packed<WIDTH>, (strip, group): (usize, usize), state: &mut State) {
+fn tile(rows: &Rows, columns: &Columns, (strip, group): (usize, usize), state: &mut State) {
     let row_lanes = &rows.lanes[strip];
     let blocks = [&columns.blocks[group], &columns.blocks[group + 1]];
     let column_lanes = [&columns.lanes[group], &columns.lanes[group + 1]];
@@ -75,9 +90,22 @@ fn tile(rows: &Packed<ROWS>, columns: &Packed<WIDTH>, (strip, group): (usize, us
         dots_wide(&rows.blocks[strip], blocks)
     };
 
+    settle(&dots, row_lanes, column_lanes, (strip, group), state);
+}
+
+/// Turns a tile of products into scores and keeps those that beat a second best.
+#[target_feature(enable = "avx2")]
+#[inline]
+pub(super) fn settle(
+    dots: &Tile,
+    row_lanes: &Lanes<ROWS>,
+    column_lanes: [&Lanes<WIDTH>; GROUP],
+    (strip, group): (usize, usize),
+    state: &mut State,
+) {
     let row_second: &[i32; ROWS] = lanes_at(&state.row_best.second, strip);
-    let mut scores = dots;
-    let mut better = dots;
+    let mut scores = *dots;
+    let mut better = *dots;
     let mut any = _mm256_setzero_si256();
     for c in 0..GROUP {
         let column_second = load(lanes_at(&state.column_best.second, group + c));
@@ -198,7 +226,7 @@ fn offer(scores: &Tile, better: &Tile, (strip, group): (usize, usize), state: &m
 
 #[target_feature(enable = "avx2")]
 #[inline]
-fn load(words: &[i32; WIDTH]) -> __m256i {
+pub(super) fn load(words: &[i32; WIDTH]) -> __m256i {
     bytemuck::must_cast(*words)
 }
 

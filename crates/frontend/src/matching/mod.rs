@@ -1,28 +1,47 @@
-//! Features of two photographs that look alike: exact nearest neighbours in both directions, with ratio and mutual tests.
+//! Features of two photographs that look alike: nearest neighbours in both directions, with ratio and mutual tests.
 //!
 //! Distance is Euclidean between descriptors as bytes. Its square is an integer, `|a|² + |b|² − 2 a·b`, so every kernel
 //! gives the same bits. For descriptors of equal length it orders neighbours as the angle between them does, and it
 //! needs no assumption on how they were scaled. Ratio test: Lowe 2004.
 //!
-//! A kernel computes each product once and keeps the best two scores of its row *and* of its column. A bound that
-//! rejects candidates before their full product would stand in the kernels' `tile`, where second-best scores are known.
+//! Three matchers. [`Matcher::Exact`] computes every product, with the best kernel that the processor has.
+//! [`Matcher::Cascade`] gives the same answer, bit for bit, from bounds that reject nearly all pairs first.
+//! [`Matcher::Ann`] looks for neighbours in a few cells only and misses some.
+//!
+//! Images are [prepared](PreparedImage) once and then matched with as many others as need be.
 
+#[cfg(target_arch = "x86_64")]
+mod amx;
+mod ann;
 #[cfg(target_arch = "x86_64")]
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 pub mod guided;
+#[cfg(target_arch = "x86_64")]
+mod avx_vnni;
+mod cascade;
+mod cells;
+mod distance;
+mod kernel;
 mod nearest;
 #[cfg(target_arch = "x86_64")]
 mod pack;
+mod prepared;
 mod scalar;
+mod sketch;
+mod sweep;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_cascade;
 
 use serde::{Deserialize, Serialize};
 use terrane_scene::{DESCRIPTOR_LEN, Features};
 
+pub use kernel::{MatchKernel, PackedColumns, PackedRows};
 pub use nearest::{Nearest, Neighbour};
+pub use prepared::{PreparedImage, cascade_paths, match_prepared};
 
 /// Two features that look alike.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -36,6 +55,43 @@ pub struct Match {
     pub ratio: f32,
 }
 
+/// How neighbours are found.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Matcher {
+    /// Among all, every product computed.
+    Exact,
+    /// Among all, most rejected by bounds: the answer of [`Matcher::Exact`] in a fraction of the time.
+    #[default]
+    Cascade,
+    /// In a few cells, for very many features an image: some matches are missed.
+    Ann,
+}
+
+impl Matcher {
+    /// Every matcher.
+    pub const ALL: [Matcher; 3] = [Matcher::Exact, Matcher::Cascade, Matcher::Ann];
+
+    /// The name in options and flags.
+    pub fn name(self) -> &'static str {
+        match self {
+            Matcher::Exact => "exact",
+            Matcher::Cascade => "cascade",
+            Matcher::Ann => "ann",
+        }
+    }
+}
+
+impl std::str::FromStr for Matcher {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        let known = || Matcher::ALL.map(Matcher::name).join(", ");
+        let found = Matcher::ALL.into_iter().find(|matcher| matcher.name() == name);
+        found.ok_or_else(|| format!("`{name}` is no matcher; known are {}", known()))
+    }
+}
+
 /// How features are matched.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -47,60 +103,22 @@ pub struct MatchOptions {
     pub mutual: bool,
     /// Greatest distance between descriptors scaled to length one, in (0, 2]. Default 0.7 (COLMAP).
     pub max_distance: f64,
+    /// How neighbours are found. Default `cascade`.
+    pub matcher: Matcher,
 }
 
 impl Default for MatchOptions {
     fn default() -> Self {
-        Self { max_ratio: 0.8, mutual: true, max_distance: 0.7 }
+        Self { max_ratio: 0.8, mutual: true, max_distance: 0.7, matcher: Matcher::default() }
     }
 }
 
-/// One way to find nearest neighbours; all give the same answer.
-#[derive(Clone, Copy, Debug)]
-pub struct MatchKernel {
-    name: &'static str,
-    nearest: fn(&[[u8; DESCRIPTOR_LEN]], &[[u8; DESCRIPTOR_LEN]]) -> Nearest,
-}
-
-impl MatchKernel {
-    /// The kernels that this processor can run, slowest first. The first is the scalar oracle.
-    pub fn available() -> Vec<Self> {
-        #[allow(unused_mut)]
-        let mut kernels = vec![Self { name: "scalar", nearest: scalar::nearest }];
-        #[cfg(target_arch = "x86_64")]
-        {
-            if avx2::is_available() {
-                kernels.push(Self { name: "avx2", nearest: avx2::nearest });
-            }
-            if avx512::is_available() {
-                kernels.push(Self { name: "avx512-vnni", nearest: avx512::nearest });
-            }
-        }
-        kernels
-    }
-
-    /// The fastest kernel that this processor can run.
-    pub fn fastest() -> Self {
-        Self::available().pop().unwrap_or(Self { name: "scalar", nearest: scalar::nearest })
-    }
-
-    /// Which path this is: `scalar`, `avx2` or `avx512-vnni`.
-    pub fn name(&self) -> &'static str {
-        self.name
-    }
-
-    /// Nearest neighbours in both directions. At most 2³² − 1 descriptors a side.
-    pub fn nearest(&self, first: &[[u8; DESCRIPTOR_LEN]], second: &[[u8; DESCRIPTOR_LEN]]) -> Nearest {
-        (self.nearest)(first, second)
-    }
-}
-
-/// Matches two images' features with the fastest kernel. Ascending in `first`; one thread.
+/// Matches two images' features. Ascending in `first`; one thread. Whoever matches an image more than once prepares it.
 pub fn match_features(first: &Features, second: &Features, options: &MatchOptions) -> Vec<Match> {
-    match_features_with(MatchKernel::fastest(), first, second, options)
+    match_prepared(&PreparedImage::new(first, options), &PreparedImage::new(second, options), options)
 }
 
-/// [`match_features`] with a kernel of choice, for tests and benches.
+/// [`match_features`] with every product computed by a kernel of choice, for tests and benches.
 pub fn match_features_with(
     kernel: MatchKernel,
     first: &Features,
@@ -109,7 +127,16 @@ pub fn match_features_with(
 ) -> Vec<Match> {
     let first = first.descriptors.as_chunks::<DESCRIPTOR_LEN>().0;
     let second = second.descriptors.as_chunks::<DESCRIPTOR_LEN>().0;
-    let nearest = kernel.nearest(first, second);
+    matches_of(&kernel.nearest(first, second), first, second, options)
+}
+
+/// The matches among neighbours.
+fn matches_of(
+    nearest: &Nearest,
+    first: &[[u8; DESCRIPTOR_LEN]],
+    second: &[[u8; DESCRIPTOR_LEN]],
+    options: &MatchOptions,
+) -> Vec<Match> {
     let mut matches = Vec::new();
     for (row, neighbour) in nearest.rows.iter().enumerate() {
         let Some(column) = neighbour.index else { continue };

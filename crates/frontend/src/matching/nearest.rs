@@ -47,19 +47,27 @@ impl Best {
         }
     }
 
+    /// Squared distance to the second nearest so far.
+    pub(super) fn second_squared(&self, lane: usize) -> u32 {
+        squared_distance(self.second[lane])
+    }
+
     /// The neighbours in the order that the descriptors came in: `order` is that of these lanes, `others` of the other side.
     pub(super) fn neighbours(&self, order: &[u32], others: &[u32]) -> Vec<Neighbour> {
-        let distance = |score: i32| if score <= NOTHING { u32::MAX } else { score.unsigned_abs() };
         let nobody = Neighbour { index: None, distance_squared: u32::MAX, second_squared: u32::MAX };
         let mut neighbours = vec![nobody; order.len()];
         for (lane, &source) in order.iter().enumerate() {
             let (first, second) = (self.first[lane], self.second[lane]);
             neighbours[source as usize] = Neighbour {
                 index: (first > second).then(|| others.get(self.at[lane] as usize).copied()).flatten(),
-                distance_squared: distance(first),
-                second_squared: distance(second),
+                distance_squared: squared_distance(first),
+                second_squared: squared_distance(second),
             };
         }
         neighbours
     }
+}
+
+fn squared_distance(score: i32) -> u32 {
+    if score <= NOTHING { u32::MAX } else { score.unsigned_abs() }
 }

@@ -16,13 +16,13 @@ const ABSENT: i32 = 1 << 29;
 #[repr(C, align(64))]
 pub(super) struct Block<const L: usize>(pub(super) [[i32; L]; QUADS]);
 
-/// Which side of the product the descriptors are on.
+/// How the bytes are stored.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Side {
-    /// Bytes as they are (unsigned).
-    Rows,
-    /// Bytes less [`Lanes::offset`], so that they are signed.
-    Columns,
+pub(super) enum Form {
+    /// As they are.
+    Unsigned,
+    /// Less [`Lanes::offset`].
+    Signed,
 }
 
 /// What is known of a block of descriptors besides their bytes.
@@ -34,7 +34,7 @@ pub(super) struct Lanes<const L: usize> {
     pub(super) minus_norm: [i32; L],
     /// Twice the sum of each descriptor's bytes.
     pub(super) twice_sum: [i32; L],
-    /// What was taken from each byte of a column.
+    /// What was taken from each byte.
     pub(super) offset: i32,
 }
 
@@ -49,7 +49,7 @@ pub(super) struct Packed<const L: usize> {
 
 impl<const L: usize> Packed<L> {
     /// Packs descriptors; the number of blocks is a multiple of `group`.
-    pub(super) fn new(descriptors: &[[u8; DESCRIPTOR_LEN]], side: Side, group: usize) -> Self {
+    pub(super) fn new(descriptors: &[[u8; DESCRIPTOR_LEN]], form: Form, group: usize) -> Self {
         let is_wide = |at: &u32| descriptors[*at as usize].iter().copied().max() > Some(NARROW_MAX);
         let (wide, mut order): (Vec<u32>, Vec<u32>) = (0..descriptors.len() as u32).partition(is_wide);
         let num_narrow = order.len();
@@ -59,16 +59,16 @@ impl<const L: usize> Packed<L> {
             Self { blocks: Vec::with_capacity(num_blocks), lanes: Vec::with_capacity(num_blocks), order };
         for block in 0..num_blocks {
             let narrow = ((block + 1) * L).min(packed.order.len()) <= num_narrow;
-            packed.push_block(descriptors, block * L, side, narrow);
+            packed.push_block(descriptors, block * L, form, narrow);
         }
         packed
     }
 
-    fn push_block(&mut self, descriptors: &[[u8; DESCRIPTOR_LEN]], first: usize, side: Side, narrow: bool) {
-        let offset: u8 = match (side, narrow) {
-            (Side::Rows, _) => 0,
-            (Side::Columns, true) => 64,
-            (Side::Columns, false) => 128,
+    fn push_block(&mut self, descriptors: &[[u8; DESCRIPTOR_LEN]], first: usize, form: Form, narrow: bool) {
+        let offset: u8 = match (form, narrow) {
+            (Form::Unsigned, _) => 0,
+            (Form::Signed, true) => 64,
+            (Form::Signed, false) => 128,
         };
         let mut block = Block([[0; L]; QUADS]);
         let mut lanes =

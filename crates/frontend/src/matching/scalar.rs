@@ -20,7 +20,8 @@ pub(super) fn nearest(first: &[[u8; DESCRIPTOR_LEN]], second: &[[u8; DESCRIPTOR_
     Nearest { rows: rows.neighbours(&first, &second), columns: columns.neighbours(&second, &first) }
 }
 
-fn distance_squared(a: &[u8; DESCRIPTOR_LEN], b: &[u8; DESCRIPTOR_LEN]) -> i32 {
+/// Squared Euclidean distance between bytes.
+pub(super) fn distance_squared(a: &[u8; DESCRIPTOR_LEN], b: &[u8; DESCRIPTOR_LEN]) -> i32 {
     let mut sum = 0;
     for k in 0..DESCRIPTOR_LEN {
         let difference = i32::from(a[k]) - i32::from(b[k]);

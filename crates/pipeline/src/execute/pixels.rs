@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 
 use rayon::prelude::*;
+use terrane_frontend::matching::{PreparedImage, match_prepared};
 use terrane_frontend::verification::{Candidate, NotVerified, View, verify};
-use terrane_frontend::{image, matching, pairs, sift};
+use terrane_frontend::{image, pairs, sift};
 use terrane_geometry::Seed;
 use terrane_scene::codec::{self, FeatureBatchWriter, MatchBlock};
 use terrane_scene::{Features, ImageId, ImagePair, ImageTable, MatchedPair};
@@ -146,12 +147,20 @@ pub(super) fn matching(
             }
         }
     }
+    let options = &context.config.matching.matching;
+    let prepared: BTreeMap<ImageId, PreparedImage> = images
+        .par_iter()
+        .map(|(image, features)| {
+            context.cancel.check()?;
+            Ok((*image, PreparedImage::new(features, options)))
+        })
+        .collect::<Result<_, PipelineError>>()?;
     let seed = context.config.stage_seed(Stage::Match);
     let verified: Vec<Result<MatchedPair, NotVerified>> = pairs
         .par_iter()
         .map(|pair| {
             context.cancel.check()?;
-            Ok(match_pair(context, &table, &images, *pair, seed))
+            Ok(match_pair(context, &table, (&images, &prepared), *pair, seed))
         })
         .collect::<Result<_, PipelineError>>()?;
     let mut made = MatchBlock::default();
@@ -172,13 +181,14 @@ pub(super) fn matching(
 fn match_pair(
     context: &ExecutionContext,
     table: &ImageTable,
-    images: &BTreeMap<ImageId, Features>,
+    (images, prepared): (&BTreeMap<ImageId, Features>, &BTreeMap<ImageId, PreparedImage>),
     pair: ImagePair,
     seed: Seed,
 ) -> Result<MatchedPair, NotVerified> {
     let options = &context.config.matching;
     let (first, second) = (&images[&pair.first()], &images[&pair.second()]);
-    let matches = matching::match_features(first, second, &options.matching);
+    let matches =
+        match_prepared(&prepared[&pair.first()], &prepared[&pair.second()], &options.matching);
     let candidate = Candidate {
         pair,
         first: View { camera: table.camera_of(pair.first()), keypoints: &first.keypoints },

@@ -1,0 +1,42 @@
+//! Approximate neighbours: the nearest of a few cells of the other image.
+
+use terrane_scene::DESCRIPTOR_LEN;
+
+use super::cells::{Cells, Image, Two, near};
+use super::distance::Measured;
+use super::nearest::Nearest;
+use super::sketch::Sketches;
+
+/// Cells that each descriptor looks into.
+const NUM_PROBES: usize = 3;
+
+/// What is kept of an image.
+pub(super) struct Prepared {
+    descriptors: Measured,
+    sketches: Sketches,
+    cells: Cells,
+}
+
+impl Prepared {
+    pub(super) fn new(descriptors: Vec<[u8; DESCRIPTOR_LEN]>, with_avx2: bool) -> Self {
+        let sketches = Sketches::new(&descriptors);
+        Self { cells: Cells::new(&sketches, with_avx2), sketches, descriptors: Measured::new(descriptors) }
+    }
+
+    pub(super) fn descriptors(&self) -> &[[u8; DESCRIPTOR_LEN]] {
+        &self.descriptors.descriptors
+    }
+
+    fn image(&self) -> Image<'_> {
+        Image { descriptors: &self.descriptors, sketches: &self.sketches, cells: &self.cells }
+    }
+}
+
+/// Nearest neighbours as far as they were found.
+pub(super) fn nearest(first: &Prepared, second: &Prepared) -> Nearest {
+    let (rows, columns) = near(first.image(), second.image(), NUM_PROBES);
+    Nearest {
+        rows: rows.iter().map(Two::neighbour).collect(),
+        columns: columns.iter().map(Two::neighbour).collect(),
+    }
+}

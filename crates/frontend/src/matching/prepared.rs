@@ -1,0 +1,79 @@
+//! Images made ready for matching, once for all pairs that they are in.
+
+use std::sync::OnceLock;
+
+use terrane_scene::{DESCRIPTOR_LEN, Features};
+
+use super::cascade::{self, CascadePaths, Prepared};
+use super::kernel::{MatchKernel, PackedColumns, PackedRows};
+use super::sweep::SweepPath;
+use super::{Match, MatchOptions, Matcher, Nearest, ann, matches_of};
+
+/// An image's descriptors, laid out for a matcher.
+pub struct PreparedImage(Kind);
+
+enum Kind {
+    Exact { descriptors: Vec<[u8; DESCRIPTOR_LEN]>, rows: PackedRows, columns: PackedColumns },
+    Cascade(Box<Prepared>),
+    Ann(Box<ann::Prepared>),
+}
+
+impl PreparedImage {
+    /// Prepares an image for the matcher that the options name. Takes about four times the memory of the descriptors.
+    pub fn new(features: &Features, options: &MatchOptions) -> Self {
+        let descriptors = features.descriptors.as_chunks::<DESCRIPTOR_LEN>().0.to_vec();
+        Self(match options.matcher {
+            Matcher::Exact => {
+                let kernel = MatchKernel::fastest();
+                let (rows, columns) = (kernel.pack_rows(&descriptors), kernel.pack_columns(&descriptors));
+                Kind::Exact { descriptors, rows, columns }
+            }
+            Matcher::Cascade => Kind::Cascade(Box::new(Prepared::new(paths(), descriptors))),
+            Matcher::Ann => Kind::Ann(Box::new(ann::Prepared::new(descriptors, paths().sweep != SweepPath::Scalar))),
+        })
+    }
+
+    fn descriptors(&self) -> &[[u8; DESCRIPTOR_LEN]] {
+        match &self.0 {
+            Kind::Exact { descriptors, .. } => descriptors,
+            Kind::Cascade(prepared) => prepared.descriptors(),
+            Kind::Ann(prepared) => prepared.descriptors(),
+        }
+    }
+}
+
+/// Matches two images that were prepared with these options. Ascending in `first`; one thread.
+pub fn match_prepared(first: &PreparedImage, second: &PreparedImage, options: &MatchOptions) -> Vec<Match> {
+    let nearest = match (&first.0, &second.0) {
+        (Kind::Exact { rows, .. }, Kind::Exact { columns, .. }) => {
+            MatchKernel::fastest().nearest_packed(rows, columns)
+        }
+        (Kind::Cascade(first), Kind::Cascade(second)) => cascaded(paths(), first, second, options),
+        (Kind::Ann(first), Kind::Ann(second)) => ann::nearest(first, second),
+        _ => MatchKernel::fastest().nearest(first.descriptors(), second.descriptors()),
+    };
+    matches_of(&nearest, first.descriptors(), second.descriptors(), options)
+}
+
+/// The cascade's neighbours, or all where bounds are of no use.
+pub(super) fn cascaded(
+    paths: CascadePaths,
+    first: &Prepared,
+    second: &Prepared,
+    options: &MatchOptions,
+) -> Nearest {
+    cascade::nearest(paths, first, second, options)
+        .unwrap_or_else(|| paths.kernel.nearest(first.descriptors(), second.descriptors()))
+}
+
+/// Which paths the cascade runs on this processor: that of its products and that of its bounds.
+pub fn cascade_paths() -> (&'static str, &'static str) {
+    (paths().kernel.name(), paths().sweep.name())
+}
+
+pub(super) fn paths() -> CascadePaths {
+    static PATHS: OnceLock<CascadePaths> = OnceLock::new();
+    *PATHS.get_or_init(|| {
+        CascadePaths { kernel: MatchKernel::fastest(), sweep: SweepPath::fastest() }
+    })
+}
