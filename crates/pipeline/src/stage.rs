@@ -79,7 +79,11 @@ impl Stage {
     /// The version of what the stage computes. Raised whenever its bytes would differ for the same inputs and options,
     /// so that no artefact of an older program is taken for today's.
     pub fn version(self) -> u32 {
-        1
+        match self {
+            // Since 2: what was read beside photographs, and where every artefact of the run is.
+            Stage::Export => 2,
+            _ => 1,
+        }
     }
 }
 

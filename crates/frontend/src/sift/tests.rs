@@ -103,8 +103,8 @@ fn octave_minus_one_finds_blobs_that_octave_zero_is_too_coarse_for() {
 fn scalar_and_vector_paths_agree_bit_for_bit() {
     let image = Scene::random(700, 233.0, 5).draw(233, 197, (1.0, 0.0), (0.0, 0.0));
     for first_octave in [FirstOctave::Doubled, FirstOctave::Original] {
-        let plain = extract_with(Isa::BASELINE, &image, None, &options(first_octave));
-        let best = extract_with(Isa::detect(), &image, None, &options(first_octave));
+        let plain = extract_with(Isa::BASELINE, &image, None, None, &options(first_octave));
+        let best = extract_with(Isa::detect(), &image, None, None, &options(first_octave));
         assert!(plain.len() > 100);
         assert_eq!(plain, best);
     }
