@@ -59,10 +59,11 @@ fn database(out: &Path, target: &Path) -> Result<(), Failure> {
         )));
     }
     let written = Store::local(&store).and_then(|store| output::write_database(out, &store, target));
-    let figures = written.map_err(|error| match error.is_invalid_input() || error.broken_artefact().is_some() {
-        true => Failure::input(error.to_string()),
-        false => Failure::system(error.to_string()),
-    })?;
+    let figures =
+        written.map_err(|error| match error.is_invalid_input() || error.broken_artefact().is_some() {
+            true => Failure::input(error.to_string()),
+            false => Failure::system(error.to_string()),
+        })?;
     let output::DatabaseFigures { images, keypoints, pairs, matches } = figures;
     eprintln!("{images} images, {keypoints} keypoints, {pairs} pairs, {matches} matches");
     Ok(())

@@ -53,7 +53,8 @@ mod tests {
     use crate::sift::{self, SiftOptions};
 
     fn gray(width: usize, height: usize, value: impl Fn(usize, usize) -> u8) -> GrayImage {
-        let data = (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| value(x, y)).collect();
+        let data =
+            (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| value(x, y)).collect();
         GrayImage { width, height, data }
     }
 
@@ -72,7 +73,8 @@ mod tests {
                 for column in 0..width {
                     let distance = (column as f64 - x).powi(2) + (row as f64 - y).powi(2);
                     if distance < 16.0 * sigma * sigma {
-                        sum[row * width + column] += height_of_blob * (-distance / (2.0 * sigma * sigma)).exp();
+                        sum[row * width + column] +=
+                            height_of_blob * (-distance / (2.0 * sigma * sigma)).exp();
                     }
                 }
             }

@@ -122,7 +122,8 @@ impl<'a> Join<'a> {
         let found = found.ok_or_else(|| format!("camera {} is not in the database", image.camera))?;
         let camera = found.camera.clone()?;
         let metadata = photograph.as_ref().map(|photograph| &photograph.metadata);
-        if let Some(metadata) = metadata.filter(|m| (m.width_px, m.height_px) != (camera.width_px, camera.height_px))
+        if let Some(metadata) =
+            metadata.filter(|m| (m.width_px, m.height_px) != (camera.width_px, camera.height_px))
         {
             return Err(format!(
                 "the photograph has {} x {} pixels and its camera in the database {} x {}: give the photographs \
@@ -155,7 +156,8 @@ impl<'a> Join<'a> {
     fn camera(&self, found: &DatabaseCamera, camera: Camera) -> Result<CameraRecord, String> {
         let name = format!("camera {} of the imported database", found.id);
         if let Some(given) = &self.context.config.camera {
-            let camera = given.camera(camera.width_px, camera.height_px).map_err(|error| error.to_string())?;
+            let camera =
+                given.camera(camera.width_px, camera.height_px).map_err(|error| error.to_string())?;
             return Ok(CameraRecord { camera, focal_source: FocalSource::Given, name });
         }
         let focal_source = if found.has_prior_focal { FocalSource::Exif } else { FocalSource::Guess };
@@ -311,7 +313,8 @@ pub(super) fn pairs(
 ) -> Result<PairSelection, PipelineError> {
     let database = open_unchanged(context, imported)?;
     let ids = imported.images.iter().enumerate();
-    let image_of: BTreeMap<i64, ImageId> = ids.map(|(at, image)| (image.id, ImageId::from_index(at))).collect();
+    let image_of: BTreeMap<i64, ImageId> =
+        ids.map(|(at, image)| (image.id, ImageId::from_index(at))).collect();
     let found = database.pairs().map_err(|error| failed(context, error))?;
     let mut pairs: Vec<ImagePair> = found
         .iter()
@@ -341,7 +344,9 @@ pub(super) fn matches(
     let database = open_unchanged(context, imported)?;
     let id_of = |image: ImageId| {
         let entry = imported.images.get(image.index());
-        entry.map(|image| image.id).ok_or_else(|| PipelineError::bug(format!("image {image} is not imported")))
+        entry
+            .map(|image| image.id)
+            .ok_or_else(|| PipelineError::bug(format!("image {image} is not imported")))
     };
     let as_match = |[first, second]: [u32; 2]| Match { first, second, ratio: 0.0 };
     pairs

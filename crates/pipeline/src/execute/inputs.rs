@@ -4,8 +4,8 @@
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
-use terrane_frontend::image::{self, DecodeOptions};
 use terrane_frontend::Mask;
+use terrane_frontend::image::{self, DecodeOptions};
 use terrane_scene::{ImageId, ImageRecord};
 
 use super::ExecutionContext;

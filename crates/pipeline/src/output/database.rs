@@ -8,9 +8,7 @@ use terrane_geometry::two_view::{essential_from_pose, estimate_homography};
 use terrane_geometry::{Camera, RansacOptions, Seed, fundamental::fundamental_from_eight};
 use terrane_scene::codec::Kind;
 use terrane_scene::colmap::database::{DatabaseGeometry, DatabaseWriter, SIFT_DESCRIPTORS, config_of};
-use terrane_scene::{
-    FocalSource, ImageId, ImageTable, Keypoint, MatchedPair, PairKind, SceneError,
-};
+use terrane_scene::{FocalSource, ImageId, ImageTable, Keypoint, MatchedPair, PairKind, SceneError};
 
 use crate::execute::read;
 use crate::task::FinishedRun;

@@ -70,9 +70,12 @@ fn keypoint(values: &[f32]) -> Keypoint {
 /// which the C library's is not.
 pub(super) fn angle(y: f64, x: f64) -> f64 {
     use std::f64::consts::{FRAC_PI_2, FRAC_PI_6, PI};
+    if !x.is_finite() || !y.is_finite() {
+        return f64::NAN;
+    }
     let (largest, smallest) = (x.abs().max(y.abs()), x.abs().min(y.abs()));
-    if !(largest > 0.0) || !largest.is_finite() {
-        return if largest.is_nan() || largest.is_infinite() { f64::NAN } else { 0.0 };
+    if largest == 0.0 {
+        return 0.0;
     }
     let tangent = smallest / largest;
     // Turned by a twelfth where the series would be slow: |t| is at most tan(π/12) then.

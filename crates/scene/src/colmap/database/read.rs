@@ -48,7 +48,9 @@ impl Database {
         let connection = connect(path)?;
         // Nothing in the file is longer than the file: what claims to be is a trap.
         let limit = i32::try_from(file_len + log_len(path)).unwrap_or(i32::MAX).clamp(65_536, 1_000_000_000);
-        connection.set_limit(Limit::SQLITE_LIMIT_LENGTH, limit).map_err(|error| failed("the database", error))?;
+        connection
+            .set_limit(Limit::SQLITE_LIMIT_LENGTH, limit)
+            .map_err(|error| failed("the database", error))?;
         connection
             .execute_batch("PRAGMA trusted_schema = OFF; PRAGMA cell_size_check = ON; PRAGMA mmap_size = 0;")
             .map_err(|error| failed("the database", error))?;
@@ -90,7 +92,8 @@ impl Database {
     /// # Errors
     /// Corrupt when a row makes no sense.
     pub fn cameras(&self) -> Result<Vec<DatabaseCamera>, SceneError> {
-        let sql = "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras ORDER BY rowid";
+        let sql =
+            "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras ORDER BY rowid";
         let mut cameras = Vec::new();
         self.ascending("cameras", sql, |id, row| {
             let what = format!("camera {id}");
@@ -120,10 +123,14 @@ impl Database {
                 return Err(SceneError::corrupt(format!("{what}: the number is out of range")));
             }
             if !cameras.contains(&camera) {
-                return Err(SceneError::corrupt(format!("{what} ({name}) has camera {camera}, which is not there")));
+                return Err(SceneError::corrupt(format!(
+                    "{what} ({name}) has camera {camera}, which is not there"
+                )));
             }
             if let Some(other) = names.insert(name.clone(), id) {
-                return Err(SceneError::corrupt(format!("images {other} and {id} have the same name, {name}")));
+                return Err(SceneError::corrupt(format!(
+                    "images {other} and {id} have the same name, {name}"
+                )));
             }
             images.push(DatabaseImage { id, name, camera });
             Ok(())
@@ -214,7 +221,9 @@ impl Database {
             };
             for image in [a, b] {
                 if images.binary_search(&image).is_err() {
-                    return Err(SceneError::corrupt(format!("{what} names image {image}, which is not there")));
+                    return Err(SceneError::corrupt(format!(
+                        "{what} names image {image}, which is not there"
+                    )));
                 }
             }
             let num_matches = blob::table_size(&what, integer(row, 1, &what)?, 2)?.0;
@@ -275,7 +284,9 @@ impl Database {
         while let Some(row) = rows.next().map_err(|error| failed(table, error))? {
             let id = integer(row, 0, table)?;
             if last.is_some_and(|last| id <= last) {
-                return Err(SceneError::corrupt(format!("table {table} is damaged: row {id} is out of order")));
+                return Err(SceneError::corrupt(format!(
+                    "table {table} is damaged: row {id} is out of order"
+                )));
             }
             last = Some(id);
             take(id, row)?;
@@ -316,7 +327,9 @@ fn connect(path: &Path) -> Result<Connection, SceneError> {
         let mut uri = String::from("file:");
         for byte in path.as_os_str().as_encoded_bytes() {
             match byte {
-                b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'/' | b'.' | b'-' | b'_' => uri.push(char::from(*byte)),
+                b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'/' | b'.' | b'-' | b'_' => {
+                    uri.push(char::from(*byte))
+                }
                 _ => uri.push_str(&format!("%{byte:02X}")),
             }
         }
@@ -355,7 +368,9 @@ fn check_table(
     };
     let Some((root, names)) = read().map_err(|error| failed("the database", error))? else { return Ok(None) };
     if root <= 0 {
-        return Err(SceneError::corrupt(format!("{table} is a view or a virtual table: COLMAP's is a table")));
+        return Err(SceneError::corrupt(format!(
+            "{table} is a view or a virtual table: COLMAP's is a table"
+        )));
     }
     match wanted.iter().find(|column| !names.contains(**column)) {
         Some(column) => Err(SceneError::corrupt(format!("table {table} has no column {column}"))),
@@ -400,9 +415,10 @@ fn camera(
 fn integer(row: &Row<'_>, column: usize, what: &str) -> Result<i64, SceneError> {
     match row.get_ref(column) {
         Ok(ValueRef::Integer(value)) => Ok(value),
-        Ok(other) => {
-            Err(SceneError::corrupt(format!("{what}: column {column} is {} and no integer", other.data_type())))
-        }
+        Ok(other) => Err(SceneError::corrupt(format!(
+            "{what}: column {column} is {} and no integer",
+            other.data_type()
+        ))),
         Err(error) => Err(failed(what, error)),
     }
 }
@@ -438,9 +454,9 @@ fn failed(what: &str, error: rusqlite::Error) -> SceneError {
             | ErrorCode::ReadOnly
             | ErrorCode::OutOfMemory,
         ) => SceneError::source_failed(what, error),
-        Some(ErrorCode::DatabaseBusy | ErrorCode::DatabaseLocked) => {
-            SceneError::invalid(format!("{what}: another program is writing the database: wait for it to end"))
-        }
+        Some(ErrorCode::DatabaseBusy | ErrorCode::DatabaseLocked) => SceneError::invalid(format!(
+            "{what}: another program is writing the database: wait for it to end"
+        )),
         _ => SceneError::corrupt(format!("{what} can't be read: {error}: the database is damaged")),
     }
 }

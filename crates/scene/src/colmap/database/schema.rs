@@ -1,4 +1,4 @@
-//! The tables of a database of COLMAP 4; older versions read what they know of them.
+//! The tables of a database as COLMAP 4.2.1 makes them.
 
 /// What [`super::DatabaseWriter`] makes. Each image is alone in its frame, each camera alone in its rig.
 pub(super) const TABLES: &str = "
@@ -30,7 +30,9 @@ CREATE TABLE descriptors (image_id INTEGER PRIMARY KEY NOT NULL, type INTEGER NO
 CREATE TABLE matches (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL, cols INTEGER NOT NULL,
     data BLOB);
 CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY NOT NULL, rows INTEGER NOT NULL,
-    cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB);
+    cols INTEGER NOT NULL, data BLOB, config INTEGER NOT NULL, F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB,
+    camera1 BLOB, camera2 BLOB);
+PRAGMA user_version = 4020100;
 ";
 
 /// COLMAP's number for sensors that are cameras.

@@ -82,13 +82,7 @@ impl DatabaseWriter {
     ///
     /// # Errors
     /// As [`DatabaseWriter::image`]; invalid when the bytes are not that many equal rows.
-    pub fn descriptors(
-        &mut self,
-        image: i64,
-        kind: i64,
-        rows: usize,
-        data: &[u8],
-    ) -> Result<(), SceneError> {
+    pub fn descriptors(&mut self, image: i64, kind: i64, rows: usize, data: &[u8]) -> Result<(), SceneError> {
         if data.len() % rows.max(1) != 0 {
             return Err(SceneError::invalid(format!("descriptors of image {image} are of unequal length")));
         }
@@ -130,7 +124,7 @@ impl DatabaseWriter {
         });
         let translation = pose.map(|pose| blob::bytes_of_doubles(pose.translation.iter().copied()));
         self.run(
-            "INSERT INTO two_view_geometries VALUES (?1, ?2, 2, ?3, ?4, ?5, ?6, ?7, ?8, ?9)",
+            "INSERT INTO two_view_geometries VALUES (?1, ?2, 2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, NULL, NULL)",
             params![id, geometry.matches.len() as i64, data, geometry.config, f, e, h, rotation, translation],
         )
     }
