@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
 
-/// The `terrane` binary as its users build it: optimised, with the features of the binary alone.
+/// The `terrane` binary as it is released: optimised, with all features of its own and none of the tests'.
 pub fn binary() -> &'static Path {
     static BINARY: OnceLock<PathBuf> = OnceLock::new();
     BINARY.get_or_init(|| {
@@ -19,6 +19,8 @@ pub fn binary() -> &'static Path {
             "terrane-cli",
             "--bin",
             "terrane",
+            "--features",
+            "full",
             "--message-format=json",
         ]);
         let output = build.current_dir(root()).output().expect("cargo runs");

@@ -7,7 +7,7 @@ use std::process::Command;
 const ALLOWED: &[(&str, &[&str])] = &[
     ("geometry", &["nalgebra"]),
     ("optim", &["geometry", "nalgebra", "faer", "rayon"]),
-    ("scene", &["geometry", "nalgebra"]),
+    ("scene", &["geometry", "nalgebra", "rusqlite"]),
     ("viewgraph", &["geometry", "optim", "scene", "nalgebra", "rayon"]),
     ("frontend", &["geometry", "scene", "nalgebra", "rayon", "kiddo"]),
     ("mapping", &["geometry", "optim", "scene", "viewgraph", "nalgebra", "rayon"]),

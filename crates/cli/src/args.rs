@@ -73,6 +73,14 @@ pub struct OptionFlags {
     /// How nearest features are found: cascade gives exact's answer faster; ann misses some [default: cascade].
     #[arg(long, value_name = "NAME", value_parser = matchers())]
     pub matcher: Option<Matcher>,
+    /// Folder of masks, black where features must keep out (moving things, sky, water). The mask of a/b.jpg is a/b.jpg.png,
+    /// as COLMAP names it, or a/b.png or b.png where that can be of no other photograph; others are used whole.
+    #[arg(long, value_name = "FOLDER")]
+    pub masks: Option<PathBuf>,
+    /// Take cameras, features and matches from a COLMAP database instead of computing them: learned features, for instance.
+    /// Its images are the run's; photographs then give colours, positions and times only, and may be absent.
+    #[arg(long, value_name = "DATABASE", conflicts_with = "masks")]
+    pub import: Option<PathBuf>,
     /// Seed of every random choice [default: 0].
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
@@ -204,6 +212,8 @@ pub enum Format {
     Geojson,
     /// Camera positions for globes.
     Kml,
+    /// A COLMAP database with the run's cameras, features, matches and two-view geometries, for its mappers.
+    ColmapDb,
 }
 
 /// Flags of `export`.
@@ -215,7 +225,7 @@ pub struct ExportFlags {
     #[arg(long)]
     pub format: Format,
     /// Where to write it [default: into the result's folder].
-    #[arg(long, value_name = "PATH")]
+    #[arg(short = 'o', long, value_name = "PATH")]
     pub to: Option<PathBuf>,
     /// Which component, 0 being the largest.
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -303,7 +313,10 @@ mod tests {
             "terrane run p -o o --matcher ann".into(),
             "terrane coordinator --listen 127.0.0.1:0".into(),
             "terrane worker --coordinator http://h:1".into(),
+            "terrane run p -o o --masks m".into(),
+            "terrane submit p -o o --import database.db".into(),
             "terrane export o --format colmap-txt".into(),
+            "terrane export o --format colmap-db -o database.db".into(),
             "terrane --json status".into(),
             "terrane config --dump".into(),
         ] {
@@ -315,6 +328,7 @@ mod tests {
             "terrane run p -o o --workers 0",
             "terrane run p -o o --memory x",
             "terrane run p -o o --camera FISH:1",
+            "terrane run p -o o --masks m --import database.db",
         ] {
             assert_eq!(Arguments::try_parse_from(line.split(' ')).unwrap_err().exit_code(), 2, "{line}");
         }

@@ -64,6 +64,12 @@ pub fn resolve(flags: &OptionFlags) -> Result<RunConfig, Failure> {
     if let Some(seed) = flags.seed {
         config.seed = seed;
     }
+    if let Some(masks) = &flags.masks {
+        config.masks = Some(whole_path(masks, "masks")?);
+    }
+    if let Some(database) = &flags.import {
+        config.import = Some(whole_path(database, "database")?);
+    }
     Ok(config)
 }
 
@@ -99,6 +105,11 @@ fn set_vocabulary(config: &mut RunConfig, path: &Path) -> Result<(), Failure> {
     });
     config.pairs.vocabulary.words = Some(hex);
     Ok(())
+}
+
+/// The path as every process finds it, whatever its working folder.
+fn whole_path(path: &Path, what: &str) -> Result<PathBuf, Failure> {
+    path.canonicalize().map_err(|error| Failure::input(format!("{what} {}: {error}", path.display())))
 }
 
 fn set_number(config: &mut RunConfig, key: &str, number: u64) -> Result<(), Failure> {
@@ -201,6 +212,22 @@ mod tests {
         assert_eq!(back, config);
         std::fs::write(&path, "{").unwrap();
         assert_eq!(resolve(&OptionFlags { config: Some(path), ..Default::default() }).unwrap_err().code(), 2);
+    }
+
+    #[test]
+    fn masks_and_databases_are_found_from_anywhere() {
+        let folder = tempfile::tempdir().unwrap();
+        let there = folder.path().to_path_buf();
+        let whole = there.canonicalize().unwrap();
+        let masked = resolve(&OptionFlags { masks: Some(there.clone()), ..Default::default() }).unwrap();
+        assert_eq!(masked.masks, Some(whole.clone()));
+        let importing = resolve(&OptionFlags { import: Some(there.clone()), ..Default::default() }).unwrap();
+        assert_eq!(importing.import, Some(whole));
+        let absent = Some(there.join("absent"));
+        let flags = OptionFlags { masks: absent.clone(), ..Default::default() };
+        assert_eq!(resolve(&flags).unwrap_err().code(), 2);
+        let refused = resolve(&OptionFlags { import: absent, ..Default::default() }).unwrap_err();
+        assert!(refused.code() == 2 && refused.message().contains("database"), "{}", refused.message());
     }
 
     #[test]

@@ -29,6 +29,7 @@ pub fn export(flags: &ExportFlags) -> Result<(), Failure> {
             let (positions, _) = positions(&flags.out, flags.component)?;
             into_file(&target, |file| write_kml(&positions, file))?;
         }
+        Format::ColmapDb => database(&flags.out, &target)?,
     }
     println!("{}", target.display());
     Ok(())
@@ -41,7 +42,36 @@ fn default_target(flags: &ExportFlags) -> PathBuf {
         Format::Ply => format!("points{suffix}.ply"),
         Format::Geojson => format!("cameras{suffix}.export.geojson"),
         Format::Kml => format!("cameras{suffix}.kml"),
+        Format::ColmapDb => "database.db".to_owned(),
     })
+}
+
+/// Writes the run's features and matches, which lie in the store beside its result.
+#[cfg(feature = "sqlite")]
+fn database(out: &Path, target: &Path) -> Result<(), Failure> {
+    use terrane_pipeline::{Store, output};
+
+    let store = out.join(".terrane/store");
+    if !out.join("run.json").is_file() || !store.is_dir() {
+        return Err(Failure::input(format!(
+            "{} holds no run with its artefacts (run.json and .terrane/store): give the folder of a finished run",
+            out.display()
+        )));
+    }
+    let written = Store::local(&store).and_then(|store| output::write_database(out, &store, target));
+    let figures =
+        written.map_err(|error| match error.is_invalid_input() || error.broken_artefact().is_some() {
+            true => Failure::input(error.to_string()),
+            false => Failure::system(error.to_string()),
+        })?;
+    let output::DatabaseFigures { images, keypoints, pairs, matches } = figures;
+    eprintln!("{images} images, {keypoints} keypoints, {pairs} pairs, {matches} matches");
+    Ok(())
+}
+
+#[cfg(not(feature = "sqlite"))]
+fn database(_: &Path, _: &Path) -> Result<(), Failure> {
+    Err(Failure::input("this terrane can't write databases: build it with `--features full`"))
 }
 
 fn text_model(flags: &ExportFlags, target: &Path) -> Result<(), Failure> {
@@ -146,7 +176,7 @@ mod tests {
     #[test]
     fn a_folder_without_a_result_is_named() {
         let folder = tempfile::tempdir().unwrap();
-        for format in [Format::ColmapTxt, Format::Ply, Format::Geojson, Format::Kml] {
+        for format in [Format::ColmapTxt, Format::Ply, Format::Geojson, Format::Kml, Format::ColmapDb] {
             assert_eq!(export(&flags(folder.path(), format)).unwrap_err().code(), 2, "{format:?}");
         }
     }

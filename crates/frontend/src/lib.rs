@@ -6,6 +6,7 @@
 pub mod cameras;
 mod error;
 pub mod image;
+mod mask;
 pub mod matching;
 pub mod metadata;
 pub mod pairs;
@@ -14,3 +15,4 @@ pub mod sift;
 pub mod verification;
 
 pub use error::FrontendError;
+pub use mask::Mask;

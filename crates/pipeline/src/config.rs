@@ -36,6 +36,12 @@ pub struct RunConfig {
     pub seed: u64,
     /// Intrinsics of all photographs; they are then trusted and stay as they are. Default none.
     pub camera: Option<CameraOverride>,
+    /// Folder of masks, as every worker sees it: black keeps features out. The mask of `a/b.jpg` is `a/b.jpg.png`, or
+    /// `a/b.png` or `b.png` where that is of no other photograph; a photograph without one is used whole. Default none.
+    pub masks: Option<PathBuf>,
+    /// COLMAP database that cameras, features and matches come from, as every worker sees it; `None`: terrane
+    /// computes them. Default none.
+    pub import: Option<PathBuf>,
     /// What the planner assumes about workers, to predict memory and seconds.
     pub workers: WorkerHints,
     /// Features.
@@ -195,6 +201,12 @@ impl RunConfig {
             }
         };
         check(!self.photos.as_os_str().is_empty(), "photos", "the folder of the photographs");
+        check(self.masks.is_none() || self.import.is_none(), "masks", "left out when features are imported");
+        check(
+            self.import.is_none() || cfg!(feature = "sqlite"),
+            "import",
+            "left out: this build can't read databases; build terrane with `--features full`",
+        );
         check(self.workers.threads >= 1, "workers.threads", "at least 1");
         check(self.workers.memory_bytes >= 256 << 20, "workers.memory_bytes", "at least 256 MiB");
         check((1..=1024).contains(&self.features.images_per_task), "features.images_per_task", "1 to 1,024");

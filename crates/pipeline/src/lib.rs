@@ -9,6 +9,7 @@ mod error;
 mod execute;
 mod key;
 mod listing;
+mod masks;
 pub mod output;
 mod plan;
 pub mod resources;

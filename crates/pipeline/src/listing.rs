@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use crate::masks::MaskNames;
 use crate::{PipelineError, RunConfig};
 
 /// Files that look like photographs, by path relative to the run's folder, ascending.
@@ -10,7 +11,7 @@ use crate::{PipelineError, RunConfig};
 pub(crate) struct Listing {
     /// Relative paths with `/` between parts.
     pub paths: Vec<String>,
-    /// Digest of paths, sizes and times of change.
+    /// Digest of paths, sizes and times of change, of masks and of an imported database too.
     pub digest: String,
 }
 
@@ -20,7 +21,7 @@ impl Listing {
     /// Lists the run's folder recursively, or checks its list. Links are followed, each folder once.
     ///
     /// # Errors
-    /// When the folder can't be read or holds no photograph.
+    /// When the folder can't be read or holds no photograph, unless features are imported: then there may be none.
     pub fn scan(config: &RunConfig) -> Result<Self, PipelineError> {
         let root = &config.photos;
         if !root.is_dir() {
@@ -29,23 +30,60 @@ impl Listing {
                 root.display()
             )));
         }
+        if let Some(folder) = &config.masks {
+            crate::masks::check_folder(folder, root)?;
+        }
         let paths = match &config.list {
             Some(list) => checked_list(list)?,
-            None => scan_folder(root)?,
+            None => scan_folder(config)?,
         };
         let mut hasher = blake3::Hasher::new();
         for path in &paths {
-            let (size, changed_ns) = match std::fs::metadata(root.join(path)) {
-                Ok(meta) => (meta.len(), changed_ns(&meta)),
-                Err(_) => (u64::MAX, 0),
-            };
-            hasher.update(&(path.len() as u64).to_le_bytes());
-            hasher.update(path.as_bytes());
-            hasher.update(&size.to_le_bytes());
-            hasher.update(&changed_ns.to_le_bytes());
+            add_file(&mut hasher, path, &root.join(path));
+        }
+        if let Some(folder) = &config.masks {
+            let names = MaskNames::new(paths.iter().map(String::as_str));
+            hasher.update(b"masks");
+            for mask in paths.iter().filter_map(|path| names.find(folder, path)) {
+                add_file(&mut hasher, &mask, &folder.join(&mask));
+            }
+        }
+        if let Some(database) = &config.import {
+            hasher.update(b"import");
+            hasher.update(stamp(database)?.as_bytes());
         }
         Ok(Self { paths, digest: crate::key::hex(hasher.finalize().as_bytes()) })
     }
+}
+
+/// Size and time of change of a database and of the log that may lie beside it.
+///
+/// # Errors
+/// When there is no such file.
+pub(crate) fn stamp(database: &Path) -> Result<String, PipelineError> {
+    if !database.is_file() {
+        return Err(PipelineError::invalid_input(format!(
+            "{} is not a file: name the database that holds the features",
+            database.display()
+        )));
+    }
+    let mut log = database.as_os_str().to_owned();
+    log.push("-wal");
+    let mut hasher = blake3::Hasher::new();
+    add_file(&mut hasher, "database", database);
+    add_file(&mut hasher, "log", Path::new(&log));
+    Ok(crate::key::hex(hasher.finalize().as_bytes()))
+}
+
+fn add_file(hasher: &mut blake3::Hasher, name: &str, path: &Path) {
+    let (size, changed_ns) = match std::fs::metadata(path) {
+        Ok(meta) => (meta.len(), changed_ns(&meta)),
+        Err(_) => (u64::MAX, 0),
+    };
+    hasher.update(&(name.len() as u64).to_le_bytes());
+    hasher.update(name.as_bytes());
+    hasher.update(&size.to_le_bytes());
+    hasher.update(&changed_ns.to_le_bytes());
 }
 
 #[cfg(unix)]
@@ -80,9 +118,12 @@ fn checked_list(list: &[String]) -> Result<Vec<String>, PipelineError> {
     Ok(paths.into_iter().collect())
 }
 
-fn scan_folder(root: &Path) -> Result<Vec<String>, PipelineError> {
+/// Photographs of a folder and below; masks that lie within it are none.
+fn scan_folder(config: &RunConfig) -> Result<Vec<String>, PipelineError> {
+    let root = config.photos.as_path();
     let mut paths = Vec::new();
     let mut seen = BTreeSet::new();
+    seen.extend(config.masks.as_ref().and_then(|masks| masks.canonicalize().ok()));
     let mut other_files = 0usize;
     let mut folders = vec![(root.to_path_buf(), String::new())];
     while let Some((folder, prefix)) = folders.pop() {
@@ -112,7 +153,7 @@ fn scan_folder(root: &Path) -> Result<Vec<String>, PipelineError> {
             }
         }
     }
-    if paths.is_empty() {
+    if paths.is_empty() && config.import.is_none() {
         let what = if other_files == 0 { "is empty" } else { "holds no photograph" };
         return Err(PipelineError::invalid_input(format!(
             "{} {what}: terrane reads files ending in {}",
@@ -163,6 +204,45 @@ mod tests {
         assert!(error.is_invalid_input() && error.to_string().contains("no photograph"), "{error}");
         let error = Listing::scan(&config(&dir.path().join("absent"))).unwrap_err();
         assert!(error.is_invalid_input(), "{error}");
+    }
+
+    #[test]
+    fn masks_are_watched_and_are_no_photographs() {
+        let dir = tempfile::tempdir().unwrap();
+        let masks = dir.path().join("masks");
+        std::fs::create_dir(&masks).unwrap();
+        std::fs::write(dir.path().join("a.jpg"), "a").unwrap();
+        std::fs::write(masks.join("a.jpg.png"), "mask").unwrap();
+        let plain = Listing::scan(&config(dir.path())).unwrap();
+        assert_eq!(plain.paths, ["a.jpg", "masks/a.jpg.png"]);
+        let masked = RunConfig { masks: Some(masks.clone()), ..config(dir.path()) };
+        let before = Listing::scan(&masked).unwrap();
+        assert_eq!(before.paths, ["a.jpg"]);
+        assert_ne!(before.digest, plain.digest);
+        std::fs::write(masks.join("unrelated.png"), "x").unwrap();
+        assert_eq!(Listing::scan(&masked).unwrap(), before);
+        std::fs::write(masks.join("a.jpg.png"), "another mask").unwrap();
+        assert_ne!(Listing::scan(&masked).unwrap().digest, before.digest);
+        for wrong in [dir.path().join("absent"), dir.path().to_path_buf()] {
+            let config = RunConfig { masks: Some(wrong), ..config(dir.path()) };
+            assert!(Listing::scan(&config).unwrap_err().is_invalid_input());
+        }
+    }
+
+    #[test]
+    fn an_imported_database_is_watched_and_needs_no_photographs() {
+        let dir = tempfile::tempdir().unwrap();
+        let database = dir.path().join("database.db");
+        let config = RunConfig { import: Some(database.clone()), ..config(dir.path()) };
+        assert!(Listing::scan(&config).unwrap_err().is_invalid_input());
+        std::fs::write(&database, "x").unwrap();
+        let before = Listing::scan(&config).unwrap();
+        assert!(before.paths.is_empty());
+        std::fs::write(&database, "longer").unwrap();
+        let changed = Listing::scan(&config).unwrap();
+        assert_ne!(changed, before);
+        std::fs::write(dir.path().join("database.db-wal"), "log").unwrap();
+        assert_ne!(Listing::scan(&config).unwrap(), changed);
     }
 
     #[test]

@@ -80,9 +80,10 @@ impl Stage {
     /// so that no artefact of an older program is taken for today's.
     pub fn version(self) -> u32 {
         match self {
-            // Ingest: XMP, TIFF and narrow 16-bit images. Features: colours are means of 2 x 2 pixels. Pairs: footprints,
-            // ranks. Match: cascade, single-precision screening.
-            Stage::Ingest | Stage::Features | Stage::Pairs | Stage::Match => 2,
+            // Ingest: XMP, masks, imports, TIFF and narrow 16-bit images. Features: colours are means of 2 x 2 pixels, scale
+            // space in fixed point. Pairs: footprints, ranks. Match: cascade, single-precision screening. Export: what was
+            // read beside photographs, and where every artefact of the run is.
+            Stage::Ingest | Stage::Features | Stage::Pairs | Stage::Match | Stage::Export => 2,
             _ => 1,
         }
     }

@@ -182,8 +182,12 @@ impl FeatureSet {
 pub struct FinishedRun {
     /// The image table.
     pub table: ArtefactKey,
+    /// Features of every image.
+    pub features: FeatureSet,
     /// The pairs.
     pub pairs: ArtefactKey,
+    /// Verified pairs.
+    pub matches: Vec<ArtefactKey>,
     /// The view graph.
     pub view_graph: ArtefactKey,
     /// The partition.

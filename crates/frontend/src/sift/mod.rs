@@ -25,6 +25,7 @@ mod weighted;
 use rayon::prelude::*;
 use terrane_scene::{DESCRIPTOR_LEN, Features, Keypoint};
 
+use crate::Mask;
 use crate::image::{GrayImage, RgbImage};
 use descriptor::{describe, orientations};
 use extrema::{Extremum, Thresholds};
@@ -42,17 +43,29 @@ const MIN_SIDE: usize = 12;
 /// Colours are looked up in `rgb`, or are the grey of `luma` when there is none. A photograph that is too small or
 /// without texture has no features; that is no error.
 pub fn extract(luma: &GrayImage, rgb: Option<&RgbImage>, options: &SiftOptions) -> Features {
-    extract_with((Isa::detect(), TILE_COLUMNS), luma, rgb, options)
+    extract_masked(luma, rgb, None, options)
+}
+
+/// [`extract`] with features only where a mask lets them be. What it keeps out does not count towards
+/// `options.max_features`.
+pub fn extract_masked(
+    luma: &GrayImage,
+    rgb: Option<&RgbImage>,
+    mask: Option<&Mask>,
+    options: &SiftOptions,
+) -> Features {
+    extract_with((Isa::detect(), TILE_COLUMNS), luma, rgb, mask, options)
 }
 
 fn extract_with(
     (isa, tile_columns): (Isa, usize),
     luma: &GrayImage,
     rgb: Option<&RgbImage>,
+    mask: Option<&Mask>,
     options: &SiftOptions,
 ) -> Features {
     let octaves = scale_space(isa, luma, options, tile_columns);
-    let blobs = strongest(&octaves, luma, options);
+    let blobs = strongest(&octaves, luma, mask, options);
     let oriented = orient(isa, &octaves, &blobs, luma, options);
     let descriptors: Vec<[u8; DESCRIPTOR_LEN]> = oriented
         .par_iter()
@@ -122,7 +135,7 @@ impl Blob {
 }
 
 /// The blobs that stay, in falling strength.
-fn strongest(octaves: &[Octave], luma: &GrayImage, options: &SiftOptions) -> Vec<Blob> {
+fn strongest(octaves: &[Octave], luma: &GrayImage, mask: Option<&Mask>, options: &SiftOptions) -> Vec<Blob> {
     let mut blobs: Vec<Blob> = octaves
         .iter()
         .enumerate()
@@ -139,6 +152,12 @@ fn strongest(octaves: &[Octave], luma: &GrayImage, options: &SiftOptions) -> Vec
     });
     // Two cells may have led to one and the same extremum.
     blobs.dedup_by(|a, b| a.octave == b.octave && a.extremum == b.extremum);
+    if let Some(mask) = mask {
+        blobs.retain(|blob| {
+            let Ranked { x_px, y_px } = blob.ranked(options);
+            mask.keeps(x_px, y_px)
+        });
+    }
     let ranked: Vec<Ranked> = blobs.iter().map(|blob| blob.ranked(options)).collect();
     let size = (luma.width, luma.height);
     select(&ranked, options.max_features as usize, options.spread, size)

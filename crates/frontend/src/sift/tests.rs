@@ -103,11 +103,11 @@ fn octave_minus_one_finds_blobs_that_octave_zero_is_too_coarse_for() {
 fn scalar_and_vector_paths_and_any_tiles_agree_bit_for_bit() {
     let image = Scene::random(900, 333.0, 5).draw(333, 197, (1.0, 0.0), (0.0, 0.0));
     for first_octave in [FirstOctave::Doubled, FirstOctave::Original] {
-        let plain = extract_with((Isa::BASELINE, 1 << 20), &image, None, &options(first_octave));
+        let plain = extract_with((Isa::BASELINE, 1 << 20), &image, None, None, &options(first_octave));
         assert!(plain.len() > 100);
         for isa in Isa::available() {
             for tile_columns in [1, 260, TILE_COLUMNS] {
-                let features = extract_with((isa, tile_columns), &image, None, &options(first_octave));
+                let features = extract_with((isa, tile_columns), &image, None, None, &options(first_octave));
                 assert_eq!(plain, features, "{isa:?} {tile_columns}");
             }
         }

@@ -6,17 +6,20 @@ use terrane_frontend::metadata::{self, ImageMetadata};
 use terrane_scene::codec::{ArchiveWriter, Kind};
 use terrane_scene::{ImageRecord, ImageTable, RejectedImage};
 
-use super::{ExecutionContext, Made, read};
+use super::inputs::MaskFile;
+use super::{ExecutionContext, Inputs, Made, import, read};
 use crate::PipelineError;
 use crate::listing::Listing;
+use crate::masks::MaskNames;
 
 /// Files that are in memory together at most, whatever the number of threads: they are read in runs of this length.
 const FILES_AT_ONCE: usize = 16;
 
-struct Usable {
-    path: String,
-    content_hash: String,
-    metadata: ImageMetadata,
+/// A photograph that can be used.
+pub(super) struct Usable {
+    pub path: String,
+    pub content_hash: String,
+    pub metadata: ImageMetadata,
 }
 
 pub(super) fn ingest(context: &ExecutionContext, digest: &str) -> Result<Made, PipelineError> {
@@ -39,10 +42,28 @@ pub(super) fn ingest(context: &ExecutionContext, digest: &str) -> Result<Made, P
             }
         }
     }
-    let table = table(context, usable, rejected)?;
-    let counts = vec![("images", table.images.len() as u64), ("rejected", table.rejected.len() as u64)];
+    let (table, inputs) = match context.config.import {
+        Some(_) => {
+            let (table, imported) = import::table(context, usable, rejected)?;
+            (table, Inputs { imported: Some(imported), ..Inputs::default() })
+        }
+        None => {
+            let table = table(context, usable, rejected)?;
+            let masks = masks(context, &listing, &table)?;
+            (table, Inputs { masks, ..Inputs::default() })
+        }
+    };
+    let mut counts = vec![("images", table.images.len() as u64), ("rejected", table.rejected.len() as u64)];
+    if let Some((found, missing)) = inputs.count_masks() {
+        tracing::info!(found, missing, "masks; photographs without one are used whole");
+        counts.extend([("masks", found), ("without_mask", missing)]);
+    }
     let mut archive = ArchiveWriter::new(Kind::Record);
     archive.json(read::TABLE, 0, &table).map_err(super::encode_error)?;
+    // Not there in runs that read photographs only, whose artefacts then are what they always were.
+    if !inputs.is_empty() {
+        archive.json(read::INPUTS, 0, &inputs).map_err(super::encode_error)?;
+    }
     Ok(Made { bytes: archive.finish(), counts })
 }
 
@@ -53,6 +74,26 @@ fn read_file(context: &ExecutionContext, path: &str) -> Result<Usable, RejectedI
     let metadata = metadata::read(&bytes).map_err(|error| reject(error.to_string()))?;
     let content_hash = crate::key::hex(blake3::hash(&bytes).as_bytes());
     Ok(Usable { path: path.to_owned(), content_hash, metadata })
+}
+
+/// The mask of each image, when masks were asked for. Files that are listed but can't be used count for what names of
+/// masks are ambiguous.
+fn masks(
+    context: &ExecutionContext,
+    listing: &Listing,
+    table: &ImageTable,
+) -> Result<Option<Vec<Option<MaskFile>>>, PipelineError> {
+    let Some(folder) = &context.config.masks else { return Ok(None) };
+    let names = MaskNames::new(listing.paths.iter().map(String::as_str));
+    let mask = |record: &ImageRecord| {
+        context.cancel.check()?;
+        let Some(path) = names.find(folder, &record.path) else { return Ok(None) };
+        let bytes = std::fs::read(folder.join(&path))
+            .map_err(|error| PipelineError::io(&format!("can't read mask {path}"), &error))?;
+        let content_hash = crate::key::hex(blake3::hash(&bytes).as_bytes());
+        Ok(Some(MaskFile { path, content_hash }))
+    };
+    table.images.par_iter().map(mask).collect::<Result<Vec<_>, _>>().map(Some)
 }
 
 fn table(

@@ -3,7 +3,13 @@
 mod appearance;
 mod components;
 mod graph;
+#[cfg(feature = "sqlite")]
+mod import;
+#[cfg(not(feature = "sqlite"))]
+#[path = "no_import.rs"]
+mod import;
 mod ingest;
+mod inputs;
 mod pixels;
 pub(crate) mod read;
 mod report;
@@ -16,6 +22,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use terrane_scene::{ImageTable, SceneError};
 
+pub(crate) use inputs::Inputs;
 pub(crate) use report::RunReport;
 
 use crate::{ArtefactKey, PipelineError, Put, RunConfig, Store, Task, TaskError, TaskReport, TaskSpec};
@@ -47,7 +54,7 @@ pub struct ExecutionContext {
     /// The signal to stop.
     pub cancel: Cancel,
     pool: rayon::ThreadPool,
-    table: Mutex<Option<(ArtefactKey, Arc<ImageTable>)>>,
+    table: Mutex<Option<(ArtefactKey, Arc<ImageTable>, Arc<Inputs>)>>,
 }
 
 impl ExecutionContext {
@@ -72,13 +79,23 @@ impl ExecutionContext {
 
     /// The run's image table, which nearly every task reads: decoded once.
     pub(crate) fn table(&self, store: &Store, key: &ArtefactKey) -> Result<Arc<ImageTable>, PipelineError> {
+        Ok(self.ingested(store, key)?.0)
+    }
+
+    /// The run's image table, and what is read beside photographs.
+    pub(crate) fn ingested(
+        &self,
+        store: &Store,
+        key: &ArtefactKey,
+    ) -> Result<(Arc<ImageTable>, Arc<Inputs>), PipelineError> {
         let mut cached = self.table.lock().unwrap_or_else(PoisonError::into_inner);
         match &*cached {
-            Some((of, table)) if of == key => Ok(table.clone()),
+            Some((of, table, inputs)) if of == key => Ok((table.clone(), inputs.clone())),
             _ => {
-                let table = Arc::new(read::table(store, key)?.table);
-                *cached = Some((*key, table.clone()));
-                Ok(table)
+                let read = read::table(store, key)?;
+                let (table, inputs) = (Arc::new(read.table), Arc::new(read.inputs));
+                *cached = Some((*key, table.clone(), inputs.clone()));
+                Ok((table, inputs))
             }
         }
     }

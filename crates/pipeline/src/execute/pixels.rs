@@ -1,18 +1,20 @@
 //! The stages that look at pixels and descriptors: features, pairs, match.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 
 use rayon::prelude::*;
-use terrane_frontend::matching::{PreparedImage, match_prepared};
+use terrane_frontend::matching::{Match, PreparedImage, match_prepared};
 use terrane_frontend::verification::{Candidate, NotVerified, View, verify};
 use terrane_frontend::{image, pairs, sift};
-use terrane_geometry::Seed;
+use terrane_geometry::ransac::SampleOrder;
 use terrane_scene::codec::{self, FeatureBatchWriter, MatchBlock};
-use terrane_scene::{Features, ImageId, ImagePair, ImageTable, MatchedPair};
+use terrane_scene::{Features, ImageId, ImagePair, ImageRecord, ImageTable, MatchedPair};
 
+use super::inputs::{MaskFile, read_mask, read_unchanged};
 use super::read::{self, PairsInfo};
-use super::{ExecutionContext, Made, appearance, encode_error};
+use super::{ExecutionContext, Made, appearance, encode_error, import};
 use crate::task::FeatureSet;
 use crate::{ArtefactKey, PipelineError, Stage, Store};
 
@@ -26,7 +28,7 @@ pub(super) fn features(
     first: ImageId,
     count: u32,
 ) -> Result<Made, PipelineError> {
-    let table = context.table(store, table_key)?;
+    let (table, inputs) = context.ingested(store, table_key)?;
     let images: Vec<ImageId> = (first.0..first.0 + count).map(ImageId).collect();
     if images.iter().any(|image| image.index() >= table.images.len()) {
         return Err(PipelineError::bug(format!("images from {first} are not in the table")));
@@ -38,10 +40,14 @@ pub(super) fn features(
     let (mut num_features, mut num_rejected) = (0, 0);
     for chunk in images.chunks(at_once) {
         context.cancel.check()?;
-        let computed: Vec<Result<Result<Features, String>, PipelineError>> =
-            chunk.par_iter().map(|image| features_of(context, &table, *image)).collect();
+        let computed: Vec<Result<Features, String>> = match &inputs.imported {
+            Some(imported) => import::features(context, &table, imported, chunk)?,
+            None => chunk
+                .par_iter()
+                .map(|image| features_of(context, table.image(*image), inputs.mask_of(*image)))
+                .collect::<Result<_, PipelineError>>()?,
+        };
         for outcome in computed {
-            let outcome = outcome?;
             match &outcome {
                 Ok(features) => num_features += features.len() as u64,
                 Err(_) => num_rejected += 1,
@@ -60,25 +66,22 @@ fn pixels_of(record: &terrane_scene::ImageRecord) -> u64 {
 /// The features of an image, or why its pixels can't be used.
 fn features_of(
     context: &ExecutionContext,
-    table: &ImageTable,
-    image: ImageId,
+    record: &ImageRecord,
+    mask: Option<&MaskFile>,
 ) -> Result<Result<Features, String>, PipelineError> {
-    let record = table.image(image);
-    let path = context.config.photos.join(&record.path);
-    let bytes = std::fs::read(&path)
-        .map_err(|error| PipelineError::io(&format!("can't read {}", path.display()), &error))?;
-    if crate::key::hex(blake3::hash(&bytes).as_bytes()) != record.content_hash {
-        return Err(PipelineError::invalid_input(format!(
-            "{} changed during the run: run again to begin with the new file",
-            path.display()
-        )));
-    }
+    let bytes = read_unchanged(&context.config.photos.join(&record.path), &record.content_hash)?;
     let options = &context.config.features;
+    let mask = match mask.map(|file| read_mask(context, file, record)).transpose()?.transpose() {
+        Ok(mask) => mask,
+        Err(reason) => return Ok(Err(reason)),
+    };
     let decoded = image::decode(&bytes, &options.decode);
     // The file is not needed beside the scale space.
     drop(bytes);
     Ok(match decoded {
-        Ok(decoded) => Ok(sift::extract(&decoded.luma, decoded.rgb.as_ref(), &options.sift)),
+        Ok(decoded) => {
+            Ok(sift::extract_masked(&decoded.luma, decoded.rgb.as_ref(), mask.as_ref(), &options.sift))
+        }
         Err(error) => Err(error.to_string()),
     })
 }
@@ -90,7 +93,7 @@ pub(super) fn pairs(
     features: &FeatureSet,
     lost: &[(ImageId, u32, String)],
 ) -> Result<Made, PipelineError> {
-    let table = context.table(store, table_key)?;
+    let (table, inputs) = context.ingested(store, table_key)?;
     let options = &context.config.pairs;
     let mut info = PairsInfo { num_features: vec![0; table.images.len()], ..Default::default() };
     for (first, count, reason) in lost {
@@ -109,11 +112,16 @@ pub(super) fn pairs(
         }
     }
     info.rejected.sort();
-    let similar = match pairs::wanted_similar(&table, &options.select) {
-        Some(wanted) => Some(appearance::similar_images(store, context, features, &wanted)?),
-        None => None,
+    let selection = match inputs.imported_matches() {
+        Some(imported) => import::pairs(context, &table, imported)?,
+        None => {
+            let similar = match pairs::wanted_similar(&table, &options.select) {
+                Some(wanted) => Some(appearance::similar_images(store, context, features, &wanted)?),
+                None => None,
+            };
+            pairs::select(&table, similar.as_deref(), &options.select)
+        }
     };
-    let selection = pairs::select(&table, similar.as_deref(), &options.select);
     let has_features = |image: ImageId| info.num_features[image.index()] > 0;
     let chosen: Vec<ImagePair> = selection
         .pairs
@@ -134,7 +142,7 @@ pub(super) fn matching(
     block: u32,
     features: &FeatureSet,
 ) -> Result<Made, PipelineError> {
-    let table = context.table(store, table_key)?;
+    let (table, inputs) = context.ingested(store, table_key)?;
     let (blocks, _) = read::pairs(store, pairs_key)?;
     let pairs = blocks
         .get(block as usize)
@@ -147,20 +155,36 @@ pub(super) fn matching(
             }
         }
     }
+    let imported = inputs.imported_matches();
+    let imported = imported.map(|imported| import::matches(context, imported, pairs)).transpose()?;
     let options = &context.config.matching.matching;
-    let prepared: BTreeMap<ImageId, PreparedImage> = images
-        .par_iter()
-        .map(|(image, features)| {
-            context.cancel.check()?;
-            Ok((*image, PreparedImage::new(features, options)))
-        })
-        .collect::<Result<_, PipelineError>>()?;
+    let mut verification = context.config.matching.verification.clone();
+    if imported.is_some() {
+        // No match is known to be better than another: their order says nothing.
+        verification.ransac.order = SampleOrder::Uniform;
+    }
+    let prepared = match imported {
+        Some(_) => BTreeMap::new(),
+        None => prepared(context, &images)?,
+    };
     let seed = context.config.stage_seed(Stage::Match);
     let verified: Vec<Result<MatchedPair, NotVerified>> = pairs
         .par_iter()
-        .map(|pair| {
+        .enumerate()
+        .map(|(at, pair)| {
             context.cancel.check()?;
-            Ok(match_pair(context, &table, (&images, &prepared), *pair, seed))
+            let (first, second) = (pair.first(), pair.second());
+            let matches = match &imported {
+                Some(imported) => Cow::Borrowed(imported[at].as_slice()),
+                None => Cow::Owned(match_prepared(&prepared[&first], &prepared[&second], options)),
+            };
+            let candidate = Candidate {
+                pair: *pair,
+                first: View { camera: table.camera_of(first), keypoints: &images[&first].keypoints },
+                second: View { camera: table.camera_of(second), keypoints: &images[&second].keypoints },
+                matches: &matches,
+            };
+            Ok(verify(&candidate, &verification, seed))
         })
         .collect::<Result<_, PipelineError>>()?;
     let mut made = MatchBlock::default();
@@ -178,24 +202,16 @@ pub(super) fn matching(
     Ok(Made { bytes: codec::encode_match_block(&made).map_err(encode_error)?, counts })
 }
 
-fn match_pair(
+/// Descriptors as the matcher wants them, once an image of the block.
+fn prepared(
     context: &ExecutionContext,
-    table: &ImageTable,
-    (images, prepared): (&BTreeMap<ImageId, Features>, &BTreeMap<ImageId, PreparedImage>),
-    pair: ImagePair,
-    seed: Seed,
-) -> Result<MatchedPair, NotVerified> {
-    let options = &context.config.matching;
-    let (first, second) = (&images[&pair.first()], &images[&pair.second()]);
-    let matches =
-        match_prepared(&prepared[&pair.first()], &prepared[&pair.second()], &options.matching);
-    let candidate = Candidate {
-        pair,
-        first: View { camera: table.camera_of(pair.first()), keypoints: &first.keypoints },
-        second: View { camera: table.camera_of(pair.second()), keypoints: &second.keypoints },
-        matches: &matches,
+    images: &BTreeMap<ImageId, Features>,
+) -> Result<BTreeMap<ImageId, PreparedImage>, PipelineError> {
+    let prepare = |(image, features): (&ImageId, &Features)| {
+        context.cancel.check()?;
+        Ok((*image, PreparedImage::new(features, &context.config.matching.matching)))
     };
-    verify(&candidate, &options.verification, seed)
+    images.par_iter().map(prepare).collect()
 }
 
 /// The reason without its numbers, to count by.

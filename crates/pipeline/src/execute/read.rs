@@ -15,11 +15,13 @@ use terrane_scene::{
 };
 use terrane_viewgraph::{Partition, ViewGraph};
 
+use super::Inputs;
 use crate::plan::RunFigures;
 use crate::task::FeatureSet;
 use crate::{ArtefactKey, PipelineError, Store};
 
 pub(crate) const TABLE: Tag = Tag(*b"TABL");
+pub(crate) const INPUTS: Tag = Tag(*b"INPT");
 pub(crate) const GRAPH: Tag = Tag(*b"GRPH");
 pub(crate) const PARTITION: Tag = Tag(*b"PART");
 pub(crate) const SEAMS: Tag = Tag(*b"SEAM");
@@ -27,6 +29,7 @@ pub(crate) const PLACEMENT: Tag = Tag(*b"PLAC");
 pub(crate) const SHARED: Tag = Tag(*b"SHRD");
 pub(crate) const REPORT: Tag = Tag(*b"REPT");
 pub(crate) const FIGURES: Tag = Tag(*b"FIGS");
+pub(crate) const FINISHED: Tag = Tag(*b"FINI");
 
 /// An artefact in the store, read by ranges.
 pub(crate) struct StoredArtefact<'a> {
@@ -91,10 +94,18 @@ pub(crate) struct TableArtefact {
     pub digest: [u8; 32],
     /// Hash of each image's id and camera: what matching reads of it beside its features.
     pub image_digests: Vec<[u8; 32]>,
+    /// What is read beside photographs.
+    pub inputs: Inputs,
 }
 
 pub(crate) fn table(store: &Store, key: &ArtefactKey) -> Result<TableArtefact, PipelineError> {
-    let table: ImageTable = record(store, key, Kind::Record, TABLE)?;
+    let failed = scene_error(*key);
+    let archive = Archive::open(StoredArtefact::new(store, key)?, Kind::Record).map_err(&failed)?;
+    let table: ImageTable = archive.json(TABLE, 0).map_err(&failed)?;
+    let inputs = match archive.has(INPUTS, 0) {
+        true => archive.json(INPUTS, 0).map_err(&failed)?,
+        false => Inputs::default(),
+    };
     let encode =
         |value: serde_json::Result<Vec<u8>>| value.map_err(|error| PipelineError::bug(error.to_string()));
     let digest = *blake3::hash(&encode(serde_json::to_vec(&table))?).as_bytes();
@@ -112,7 +123,7 @@ pub(crate) fn table(store: &Store, key: &ArtefactKey) -> Result<TableArtefact, P
         hasher.update(camera);
         image_digests.push(*hasher.finalize().as_bytes());
     }
-    Ok(TableArtefact { table, digest, image_digests })
+    Ok(TableArtefact { table, digest, image_digests, inputs })
 }
 
 /// How pairs were chosen, and which images have no features.

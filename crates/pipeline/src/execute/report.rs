@@ -16,8 +16,8 @@ use terrane_scene::{ClusterId, ImageFate, ImageId, ImageTable};
 use terrane_viewgraph::{Partition, PartitionReport, ViewGraphReport};
 
 use super::components::{AverageReport, FinalOutcome, MergeOutcome};
-use super::read::{self, Sharded};
-use super::{Made, encode_error};
+use super::read::{self, Sharded, TableArtefact};
+use super::{Inputs, Made, encode_error};
 use crate::plan::RunFigures;
 use crate::task::FinishedRun;
 use crate::{ArtefactKey, PipelineError, Store};
@@ -26,6 +26,7 @@ use crate::{ArtefactKey, PipelineError, Store};
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RunReport {
     pub images: ImagesReport,
+    pub inputs: InputsReport,
     pub cameras: Vec<CameraReport>,
     pub pairs: PairsReport,
     pub view_graph: ViewGraphReport,
@@ -52,6 +53,26 @@ pub(crate) struct LeftOutImage {
     /// The stage that left it out.
     pub stage: String,
     pub reason: String,
+}
+
+/// What was read beside photographs.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct InputsReport {
+    pub masks: Option<MasksReport>,
+    pub database: Option<DatabaseReport>,
+}
+
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct MasksReport {
+    pub found: u64,
+    pub missing: u64,
+}
+
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct DatabaseReport {
+    pub images: u64,
+    pub without_photograph: u64,
+    pub pairs: u64,
 }
 
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -139,6 +160,7 @@ pub(super) fn export(store: &Store, run: &FinishedRun) -> Result<Made, PipelineE
     let mut archive = ArchiveWriter::new(Kind::Record);
     archive.json(read::FIGURES, 0, &figures).map_err(encode_error)?;
     archive.json(read::REPORT, 0, &report).map_err(encode_error)?;
+    archive.json(read::FINISHED, 0, run).map_err(encode_error)?;
     Ok(Made { bytes: archive.finish(), counts })
 }
 
@@ -164,7 +186,7 @@ fn figures(report: &RunReport) -> RunFigures {
 }
 
 fn gather(store: &Store, run: &FinishedRun) -> Result<RunReport, PipelineError> {
-    let table = read::table(store, &run.table)?.table;
+    let TableArtefact { table, inputs, .. } = read::table(store, &run.table)?;
     let (_, pairs) = read::pairs(store, &run.pairs)?;
     let partition = read::partition(store, &run.partition)?;
     let mut left_out = LeftOut::default();
@@ -198,6 +220,7 @@ fn gather(store: &Store, run: &FinishedRun) -> Result<RunReport, PipelineError> 
     let num_features: u64 = pairs.num_features.iter().map(|count| u64::from(*count)).sum();
     Ok(RunReport {
         images: images_report(&table, &registered, &left_out),
+        inputs: inputs_report(&table, &inputs),
         cameras: cameras_report(&table),
         pairs: PairsReport {
             chosen: pairs.num_pairs,
@@ -291,6 +314,18 @@ fn images_report(table: &ImageTable, registered: &BTreeSet<ImageId>, left_out: &
         usable: table.images.len() as u64,
         registered: registered.len() as u64,
         left_out: entries,
+    }
+}
+
+fn inputs_report(table: &ImageTable, inputs: &Inputs) -> InputsReport {
+    let without_photograph = table.images.iter().filter(|image| image.content_hash.is_empty()).count() as u64;
+    InputsReport {
+        masks: inputs.count_masks().map(|(found, missing)| MasksReport { found, missing }),
+        database: inputs.imported.as_ref().map(|imported| DatabaseReport {
+            images: imported.images.len() as u64,
+            without_photograph,
+            pairs: imported.num_pairs,
+        }),
     }
 }
 

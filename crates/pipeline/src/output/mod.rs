@@ -1,10 +1,14 @@
 //! The folder that a user gets: models, points, camera positions, report. The layout is in `docs/report.md`.
 
+#[cfg(feature = "sqlite")]
+mod database;
 mod model;
 mod report;
 
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "sqlite")]
+pub use database::{DatabaseFigures, write_database};
 pub use report::{RunCosts, StageCost};
 
 use crate::execute::read;
@@ -32,7 +36,7 @@ pub fn write(
     check_writable(out)?;
     let staging = Staging::new(out)?;
     model::write(store, &run, &report, &staging.path)?;
-    report::write_run(config, &staging.path)?;
+    report::write_run(config, export, &staging.path)?;
     report::write_report(&report, costs, &staging.path)?;
     for name in ["sparse", "points.ply", "cameras.geojson", "run.json", "report.json"] {
         staging.publish(name, out)?;

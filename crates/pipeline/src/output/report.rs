@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::model::write_text;
 use crate::execute::RunReport;
-use crate::{PipelineError, RunConfig, Stage};
+use crate::{ArtefactKey, PipelineError, RunConfig, Stage};
 
 /// What a stage cost, as the coordinator measured it: clocks are not this crate's.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -89,15 +89,18 @@ struct RunFile<'a> {
     terrane: &'static str,
     seed: u64,
     stage_versions: BTreeMap<&'static str, u32>,
+    /// The artefact that tells where everything else of the run is, for later exports.
+    result: ArtefactKey,
     config: &'a RunConfig,
 }
 
 /// Writes `run.json`: what the run can be repeated with.
-pub(super) fn write_run(config: &RunConfig, folder: &Path) -> Result<(), PipelineError> {
+pub(super) fn write_run(config: &RunConfig, result: ArtefactKey, folder: &Path) -> Result<(), PipelineError> {
     let file = RunFile {
         terrane: env!("CARGO_PKG_VERSION"),
         seed: config.seed,
         stage_versions: Stage::ALL.into_iter().map(|stage| (stage.name(), stage.version())).collect(),
+        result,
         config,
     };
     write_text(&folder.join("run.json"), &pretty(&file)?)

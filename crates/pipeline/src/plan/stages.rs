@@ -90,7 +90,9 @@ impl<'a> Planner<'a> {
         };
         let mut run = FinishedRun {
             table: table_key,
+            features,
             pairs: pairs_key,
+            matches: matches.iter().flatten().copied().collect(),
             view_graph,
             partition: partition_key,
             submaps: submaps.existing,
@@ -109,7 +111,10 @@ impl<'a> Planner<'a> {
 
     fn ingest(&mut self) -> Step<(ArtefactKey, Arc<TableArtefact>)> {
         let key_of = |config: &RunConfig, digest: &str| -> Result<ArtefactKey, PipelineError> {
-            Ok(KeyBuilder::new(Stage::Ingest).bytes(digest.as_bytes()).value(&config.camera)?.finish())
+            let key = KeyBuilder::new(Stage::Ingest).bytes(digest.as_bytes()).value(&config.camera)?;
+            // The digest tells masks and databases apart, but not that they are asked for.
+            let key = if config.masks.is_some() { key.bytes(b"masks") } else { key };
+            Ok(if config.import.is_some() { key.bytes(b"import") } else { key }.finish())
         };
         let mut files = listing(self.config, self.known, false)?;
         let mut key = key_of(self.config, &files.digest)?;
@@ -148,10 +153,13 @@ impl<'a> Planner<'a> {
         let mut items = Vec::new();
         for (batch, chunk) in images.chunks(per_batch as usize).enumerate() {
             let mut key = KeyBuilder::new(Stage::Features).value(options)?;
-            for image in chunk {
-                key = key.bytes(image.content_hash.as_bytes());
-            }
             let first = ImageId(batch as u32 * per_batch);
+            for (image, id) in chunk.iter().zip(first.0..) {
+                key = key.bytes(image.content_hash.as_bytes());
+                if !table.inputs.is_empty() {
+                    key = key.bytes(table.inputs.digest_of(ImageId(id)).as_bytes());
+                }
+            }
             let count = chunk.len() as u32;
             items.push(Item {
                 key: key.finish(),
@@ -193,8 +201,8 @@ impl<'a> Planner<'a> {
             .number(self.config.seed)
             .bytes(&table.digest)
             .value(features)?
-            .value(&lost)?
-            .finish();
+            .value(&lost)?;
+        let key = with_imported_matches(key, table).finish();
         let num_images = table.table.images.len();
         let mut inputs = vec![table_key];
         inputs.extend(features.batches.values());
@@ -238,6 +246,7 @@ impl<'a> Planner<'a> {
             for image in &images {
                 key = key.bytes(&table.image_digests[image.index()]);
             }
+            key = with_imported_matches(key, table);
             let mut inputs = vec![table_key, pairs_key];
             inputs.extend(part.batches.values());
             items.push(Item {
@@ -349,6 +358,15 @@ impl<'a> Planner<'a> {
         progress.set_aside += set_aside;
         progress.total = Some(progress.total.unwrap_or(0) + total);
         outcome
+    }
+}
+
+/// Adds to a key what it depends on when matches come from a database.
+fn with_imported_matches(key: KeyBuilder, table: &TableArtefact) -> KeyBuilder {
+    let digest = table.inputs.imported_matches().and_then(|imported| imported.matches_digest.as_ref());
+    match digest {
+        Some(digest) => key.bytes(digest.as_bytes()),
+        None => key,
     }
 }
 

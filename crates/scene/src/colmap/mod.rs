@@ -6,6 +6,8 @@
 //! frames, which COLMAP 4 writes besides, may be absent.
 
 mod binary;
+#[cfg(feature = "sqlite")]
+pub mod database;
 mod layout;
 mod read;
 mod text;
