@@ -4,13 +4,17 @@
 //! and options give the same bytes on any number of threads.
 
 pub mod cameras;
+pub mod corners;
 mod error;
+pub mod features;
 pub mod image;
 pub mod matching;
 pub mod metadata;
 pub mod pairs;
 pub mod retrieval;
 pub mod sift;
+mod simd;
+pub mod surf;
 pub mod verification;
 
 pub use error::FrontendError;

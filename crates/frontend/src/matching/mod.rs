@@ -11,6 +11,7 @@
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
+pub mod hamming;
 mod nearest;
 #[cfg(target_arch = "x86_64")]
 mod pack;
@@ -19,7 +20,7 @@ mod scalar;
 mod tests;
 
 use serde::{Deserialize, Serialize};
-use terrane_scene::{DESCRIPTOR_LEN, Features};
+use terrane_scene::{DESCRIPTOR_LEN, DescriptorKind, Features};
 
 pub use nearest::{Nearest, Neighbour};
 
@@ -46,11 +47,14 @@ pub struct MatchOptions {
     pub mutual: bool,
     /// Greatest distance between descriptors scaled to length one, in (0, 2]. Default 0.7 (COLMAP).
     pub max_distance: f64,
+    /// Limits for binary descriptors, in place of the two above.
+    pub binary: hamming::BinaryMatchOptions,
 }
 
 impl Default for MatchOptions {
     fn default() -> Self {
-        Self { max_ratio: 0.8, mutual: true, max_distance: 0.7 }
+        let binary = hamming::BinaryMatchOptions::default();
+        Self { max_ratio: 0.8, mutual: true, max_distance: 0.7, binary }
     }
 }
 
@@ -94,9 +98,19 @@ impl MatchKernel {
     }
 }
 
-/// Matches two images' features with the fastest kernel. Ascending in `first`; one thread.
+/// Matches two images' features with the fastest kernel for their descriptors. Ascending in `first`; one thread.
+///
+/// Descriptors of different kinds never match.
 pub fn match_features(first: &Features, second: &Features, options: &MatchOptions) -> Vec<Match> {
-    match_features_with(MatchKernel::fastest(), first, second, options)
+    match (first.kind, second.kind) {
+        (DescriptorKind::Bytes128, DescriptorKind::Bytes128) => {
+            match_features_with(MatchKernel::fastest(), first, second, options)
+        }
+        (DescriptorKind::Bits256, DescriptorKind::Bits256) => {
+            hamming::match_features(first, second, options)
+        }
+        _ => Vec::new(),
+    }
 }
 
 /// [`match_features`] with a kernel of choice, for tests and benches.
