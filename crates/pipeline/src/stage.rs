@@ -79,7 +79,13 @@ impl Stage {
     /// The version of what the stage computes. Raised whenever its bytes would differ for the same inputs and options,
     /// so that no artefact of an older program is taken for today's.
     pub fn version(self) -> u32 {
-        1
+        match self {
+            // 2: batches say what their descriptors are; other features than SIFT.
+            Stage::Features => 2,
+            // 2: limits for binary descriptors.
+            Stage::Match => 2,
+            _ => 1,
+        }
     }
 }
 

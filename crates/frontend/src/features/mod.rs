@@ -11,6 +11,8 @@
 //! | `surf-upright` | the same | the same, not turned |
 
 #[cfg(test)]
+pub(crate) mod scenes;
+#[cfg(test)]
 mod tests;
 
 use std::str::FromStr;

@@ -1,14 +1,14 @@
 //! The stages that look at pixels and descriptors: features, pairs, match.
 
-use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
 
 use rayon::prelude::*;
 use terrane_frontend::verification::{Candidate, NotVerified, View, verify};
-use terrane_frontend::{image, matching, pairs, retrieval, sift};
+use terrane_frontend::{features as extraction, image, matching, pairs, retrieval};
 use terrane_geometry::Seed;
 use terrane_scene::codec::{self, FeatureBatchWriter, MatchBlock};
-use terrane_scene::{Features, ImageId, ImagePair, ImageTable, MatchedPair};
+use terrane_scene::{DescriptorKind, Features, ImageId, ImagePair, ImageTable, MatchedPair};
 
 use super::read::{self, PairsInfo};
 use super::{ExecutionContext, Made, encode_error};
@@ -74,7 +74,7 @@ fn features_of(
     }
     let options = &context.config.features;
     Ok(match image::decode(&bytes, &options.decode) {
-        Ok(decoded) => Ok(sift::extract(&decoded.luma, decoded.rgb.as_ref(), &options.sift)),
+        Ok(decoded) => Ok(extraction::extract(&decoded.luma, decoded.rgb.as_ref(), &options.extraction())),
         Err(error) => Err(error.to_string()),
     })
 }
@@ -169,6 +169,12 @@ pub(super) fn matching(
                 vacant.insert(read::features(store, features, image)?);
             }
         }
+    }
+    let kinds: BTreeSet<DescriptorKind> =
+        images.values().filter(|features| !features.is_empty()).map(|features| features.kind).collect();
+    if kinds.len() > 1 {
+        let names: Vec<_> = kinds.iter().map(|kind| kind.name()).collect();
+        return Err(PipelineError::bug(format!("descriptors of {} can't be matched", names.join(" and "))));
     }
     let seed = context.config.stage_seed(Stage::Match);
     let verified: Vec<Result<MatchedPair, NotVerified>> = pairs
