@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use terrane_pipeline::{CameraOverride, Matcher};
+use terrane_pipeline::{CameraOverride, FeatureMethod, Matcher};
 
 /// Photographs in, one geo-referenced sparse reconstruction out.
 #[derive(Debug, Parser)]
@@ -64,6 +64,9 @@ pub struct OptionFlags {
     /// Trusted intrinsics of all photographs, as COLMAP writes them: MODEL:p1,p2,…
     #[arg(long, value_name = "MODEL:PARAMS")]
     pub camera: Option<CameraOverride>,
+    /// Which features are found and matched [default: sift].
+    #[arg(long, value_name = "NAME", value_parser = feature_methods())]
+    pub features: Option<FeatureMethod>,
     /// Match only the pairs of a text file, two paths a line, as COLMAP's lists of pairs.
     #[arg(long, value_name = "FILE")]
     pub pairs: Option<PathBuf>,
@@ -259,6 +262,12 @@ pub struct ConfigFlags {
     pub options: OptionFlags,
 }
 
+/// Features by their names, which help and refusals list.
+fn feature_methods() -> impl TypedValueParser<Value = FeatureMethod> {
+    PossibleValuesParser::new(FeatureMethod::ALL.map(FeatureMethod::name))
+        .try_map(|name| name.parse::<FeatureMethod>())
+}
+
 /// Bytes from a size as people write it: a number with an optional unit, 1024-based for KiB to TiB and 1000-based for kB to TB.
 pub fn parse_size(text: &str) -> Result<u64, String> {
     let text = text.trim();
@@ -292,6 +301,17 @@ mod tests {
     }
 
     #[test]
+    fn unknown_features_are_refused_with_the_known_ones() {
+        let refused = Arguments::try_parse_from(["terrane", "run", "p", "-o", "o", "--features", "bogus"]);
+        let refused = refused.unwrap_err();
+        assert_eq!(refused.exit_code(), 2);
+        let message = refused.to_string();
+        for name in ["bogus", "sift", "sift-upright", "harris", "fast", "orb", "surf", "surf-upright"] {
+            assert!(message.contains(name), "{name} is missing in: {message}");
+        }
+    }
+
+    #[test]
     fn sizes_are_read_as_people_write_them() {
         for (text, bytes) in
             [("2GiB", 2 << 30), ("512MiB", 512 << 20), ("1.5G", 3 << 29), ("2GB", 2_000_000_000), ("77", 77)]
@@ -311,6 +331,8 @@ mod tests {
             "terrane run p -o o --workers 2 --cluster-size 50 --memory 2GiB --seed 3 --set mapping.x=1"
                 .into(),
             "terrane run p -o o --matcher ann".into(),
+            "terrane run p -o o --features orb".into(),
+            "terrane submit p -o o --features surf-upright".into(),
             "terrane coordinator --listen 127.0.0.1:0".into(),
             "terrane worker --coordinator http://h:1".into(),
             "terrane run p -o o --masks m".into(),

@@ -61,6 +61,9 @@ pub fn resolve(flags: &OptionFlags) -> Result<RunConfig, Failure> {
     if let Some(matcher) = flags.matcher {
         config.matching.matching.matcher = matcher;
     }
+    if let Some(method) = flags.features {
+        config.features.method = method;
+    }
     if let Some(seed) = flags.seed {
         config.seed = seed;
     }
@@ -175,6 +178,8 @@ pub fn photographs(config: &mut RunConfig, photos: &Path) -> Result<(), Failure>
 
 #[cfg(test)]
 mod tests {
+    use terrane_pipeline::FeatureMethod;
+
     use super::*;
     use terrane_pipeline::Matcher;
 
@@ -196,6 +201,8 @@ mod tests {
             assert_eq!(resolve(&flags(&[bad])).unwrap_err().code(), 2, "{bad}");
         }
         assert_eq!(resolve(&OptionFlags { seed: Some(9), ..flags(&["seed=7"]) }).unwrap().seed, 9);
+        let flags = OptionFlags { features: Some(FeatureMethod::Orb), ..flags(&["features.method=surf"]) };
+        assert_eq!(resolve(&flags).unwrap().features.method, FeatureMethod::Orb);
         let sized = resolve(&OptionFlags { cluster_size: Some(50), ..Default::default() }).unwrap();
         assert_eq!(sized.partition.max_cluster_size, 50);
         let matched = OptionFlags { matcher: Some(Matcher::Ann), ..flags(&["matching.matching.matcher=exact"]) };

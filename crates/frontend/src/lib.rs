@@ -4,7 +4,9 @@
 //! and options give the same bytes on any number of threads.
 
 pub mod cameras;
+pub mod corners;
 mod error;
+pub mod features;
 pub mod image;
 mod mask;
 pub mod matching;
@@ -12,6 +14,8 @@ pub mod metadata;
 pub mod pairs;
 pub mod retrieval;
 pub mod sift;
+mod simd;
+pub mod surf;
 pub mod verification;
 
 pub use error::FrontendError;

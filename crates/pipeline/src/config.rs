@@ -4,11 +4,14 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
+use terrane_frontend::corners::CornerOptions;
+use terrane_frontend::features::{FeatureMethod, FeatureOptions};
 use terrane_frontend::image::DecodeOptions;
 use terrane_frontend::matching::MatchOptions;
 use terrane_frontend::pairs::{BlockOptions, PairOptions};
 use terrane_frontend::retrieval::{RetrievalOptions, VocabularyOptions};
 use terrane_frontend::sift::SiftOptions;
+use terrane_frontend::surf::SurfOptions;
 use terrane_frontend::verification::VerificationOptions;
 use terrane_fusion::adjust::AdjustOptions;
 use terrane_fusion::align::AlignOptions;
@@ -94,13 +97,29 @@ pub struct FeatureStageOptions {
     pub images_per_task: u32,
     /// Decoding.
     pub decode: DecodeOptions,
-    /// Detection and description.
+    /// Which features; the command line's `--features`.
+    pub method: FeatureMethod,
+    /// Of SIFT.
     pub sift: SiftOptions,
+    /// Of Harris, FAST and ORB.
+    pub corners: CornerOptions,
+    /// Of SURF.
+    pub surf: SurfOptions,
 }
 
 impl Default for FeatureStageOptions {
     fn default() -> Self {
-        Self { images_per_task: 8, decode: DecodeOptions::default(), sift: SiftOptions::default() }
+        let FeatureOptions { method, sift, corners, surf } = FeatureOptions::default();
+        Self { images_per_task: 8, decode: DecodeOptions::default(), method, sift, corners, surf }
+    }
+}
+
+impl FeatureStageOptions {
+    /// Detection and description: what the method reads, and defaults elsewhere, so that options of other methods do not
+    /// bear on keys.
+    pub fn extraction(&self) -> FeatureOptions {
+        let Self { method, sift, corners, surf, .. } = self.clone();
+        FeatureOptions { method, sift, corners, surf }.that_matter()
     }
 }
 
@@ -222,6 +241,7 @@ impl RunConfig {
         if let Err(rule) = self.pairs.vocabulary.given() {
             problems.push(format!("pairs.vocabulary.words: {rule}"));
         }
+        problems.extend(self.features.extraction().validate().err().map(|error| format!("features.{error}")));
         problems.extend(self.mapping.validate("mapping"));
         problems
     }
@@ -249,6 +269,21 @@ mod tests {
         for bad in ["PINHOLE", "PINHOLE:1,2,3", "FISH:1,2,3,4", "PINHOLE:a,b,c,d", "PINHOLE:-1,1,0,0"] {
             assert!(bad.parse::<CameraOverride>().unwrap_err().is_invalid_input(), "{bad}");
         }
+    }
+
+    #[test]
+    fn only_options_of_the_chosen_features_matter() {
+        let mut config = RunConfig { photos: "p".into(), ..Default::default() };
+        let sift = config.features.extraction();
+        config.features.surf.hessian_threshold = -1.0;
+        config.features.corners.max_features = 5;
+        assert_eq!(config.features.extraction(), sift);
+        assert!(config.validate().is_empty());
+        config.features.method = FeatureMethod::Surf;
+        let problems = config.validate();
+        assert!(problems.len() == 1 && problems[0].contains("features.surf: hessian_threshold"), "{problems:?}");
+        let named: RunConfig = serde_json::from_str(r#"{"features": {"method": "surf-upright"}}"#).unwrap();
+        assert_eq!(named.features.method, FeatureMethod::SurfUpright);
     }
 
     #[test]

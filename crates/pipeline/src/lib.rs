@@ -26,3 +26,4 @@ pub use stage::Stage;
 pub use store::{Put, Store};
 pub use task::{Task, TaskReport, TaskSpec};
 pub use terrane_frontend::matching::Matcher;
+pub use terrane_frontend::features::FeatureMethod;

@@ -16,7 +16,7 @@ mod reconstruction;
 mod submap;
 
 pub use error::SceneError;
-pub use features::{DESCRIPTOR_LEN, Features, Keypoint};
+pub use features::{BINARY_DESCRIPTOR_LEN, DESCRIPTOR_LEN, DescriptorKind, Features, Keypoint};
 pub use ids::{CameraId, ClusterId, ComponentId, ImageId, PointIndex};
 pub use image::{
     AttitudeOf, AttitudePrior, CameraRecord, FlightPrior, FocalSource, GpsPrior, ImageRecord, ImageTable,

@@ -17,12 +17,13 @@ mod ann;
 mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
-pub mod guided;
 #[cfg(target_arch = "x86_64")]
 mod avx_vnni;
 mod cascade;
 mod cells;
 mod distance;
+pub mod guided;
+pub mod hamming;
 mod kernel;
 mod nearest;
 #[cfg(target_arch = "x86_64")]
@@ -105,15 +106,19 @@ pub struct MatchOptions {
     pub max_distance: f64,
     /// How neighbours are found. Default `cascade`.
     pub matcher: Matcher,
+    /// Limits for binary descriptors, in place of the two above.
+    pub binary: hamming::BinaryMatchOptions,
 }
 
 impl Default for MatchOptions {
     fn default() -> Self {
-        Self { max_ratio: 0.8, mutual: true, max_distance: 0.7, matcher: Matcher::default() }
+        let binary = hamming::BinaryMatchOptions::default();
+        Self { max_ratio: 0.8, mutual: true, max_distance: 0.7, matcher: Matcher::default(), binary }
     }
 }
 
-/// Matches two images' features. Ascending in `first`; one thread. Whoever matches an image more than once prepares it.
+/// Matches two images' features. Ascending in `first`; one thread. Descriptors of different kinds never match. Whoever
+/// matches an image more than once prepares it.
 pub fn match_features(first: &Features, second: &Features, options: &MatchOptions) -> Vec<Match> {
     match_prepared(&PreparedImage::new(first, options), &PreparedImage::new(second, options), options)
 }

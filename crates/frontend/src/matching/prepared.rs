@@ -2,12 +2,12 @@
 
 use std::sync::OnceLock;
 
-use terrane_scene::{DESCRIPTOR_LEN, Features};
+use terrane_scene::{BINARY_DESCRIPTOR_LEN, DESCRIPTOR_LEN, DescriptorKind, Features};
 
 use super::cascade::{self, CascadePaths, Prepared};
 use super::kernel::{MatchKernel, PackedColumns, PackedRows};
 use super::sweep::SweepPath;
-use super::{Match, MatchOptions, Matcher, Nearest, ann, matches_of};
+use super::{Match, MatchOptions, Matcher, Nearest, ann, hamming, matches_of};
 
 /// An image's descriptors, laid out for a matcher.
 pub struct PreparedImage(Kind);
@@ -16,11 +16,16 @@ enum Kind {
     Exact { descriptors: Vec<[u8; DESCRIPTOR_LEN]>, rows: PackedRows, columns: PackedColumns },
     Cascade(Box<Prepared>),
     Ann(Box<ann::Prepared>),
+    Bits(Vec<[u8; BINARY_DESCRIPTOR_LEN]>),
 }
 
 impl PreparedImage {
-    /// Prepares an image for the matcher that the options name. Takes about four times the memory of the descriptors.
+    /// Prepares an image for the matcher that the options name; binary descriptors have but one. Takes about four times the
+    /// memory of the descriptors.
     pub fn new(features: &Features, options: &MatchOptions) -> Self {
+        if features.kind == DescriptorKind::Bits256 {
+            return Self(Kind::Bits(features.bits().to_vec()));
+        }
         let descriptors = features.descriptors.as_chunks::<DESCRIPTOR_LEN>().0.to_vec();
         Self(match options.matcher {
             Matcher::Exact => {
@@ -38,13 +43,17 @@ impl PreparedImage {
             Kind::Exact { descriptors, .. } => descriptors,
             Kind::Cascade(prepared) => prepared.descriptors(),
             Kind::Ann(prepared) => prepared.descriptors(),
+            Kind::Bits(_) => &[],
         }
     }
 }
 
-/// Matches two images that were prepared with these options. Ascending in `first`; one thread.
+/// Matches two images that were prepared with these options. Ascending in `first`; one thread. Descriptors of different
+/// kinds never match.
 pub fn match_prepared(first: &PreparedImage, second: &PreparedImage, options: &MatchOptions) -> Vec<Match> {
     let nearest = match (&first.0, &second.0) {
+        (Kind::Bits(first), Kind::Bits(second)) => return hamming::match_bits(first, second, options),
+        (Kind::Bits(_), _) | (_, Kind::Bits(_)) => return Vec::new(),
         (Kind::Exact { rows, .. }, Kind::Exact { columns, .. }) => {
             MatchKernel::fastest().nearest_packed(rows, columns)
         }

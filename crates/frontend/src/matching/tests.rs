@@ -18,6 +18,7 @@ fn features(descriptors: &[Descriptor]) -> Features {
         keypoints: vec![keypoint; descriptors.len()],
         descriptors: descriptors.as_flattened().to_vec(),
         colors: vec![[0; 3]; descriptors.len()],
+        ..Features::default()
     }
 }
 

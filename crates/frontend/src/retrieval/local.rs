@@ -38,7 +38,7 @@ impl Sketch {
         let scale = |at: usize| features.keypoints[at].scale_px;
         order.sort_by(|&a, &b| scale(b).total_cmp(&scale(a)).then(a.cmp(&b)));
         order.truncate(count);
-        let rows = features.descriptors.as_chunks::<DESCRIPTOR_LEN>().0;
+        let rows = features.vectors();
         let descriptors = order.iter().filter_map(|&at| rows.get(at).copied()).collect();
         let xy_px: Vec<[f32; 2]> =
             order.iter().map(|&at| [features.keypoints[at].x_px, features.keypoints[at].y_px]).collect();

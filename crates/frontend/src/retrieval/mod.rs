@@ -112,14 +112,14 @@ impl Vocabulary {
     /// The global descriptor of an image: `num_words() * DESCRIPTOR_LEN` numbers of length one, or empty for an image
     /// without features.
     pub fn encode(&self, features: &Features) -> Vec<f32> {
-        vlad::encode(self.words(), features.descriptors.as_chunks::<DESCRIPTOR_LEN>().0)
+        vlad::encode(self.words(), &features.vectors())
     }
 }
 
 /// Draws at most `count` of an image's descriptors for training, without repetition, in the order of the features.
-/// Bytes, row after row. The seed should be that of the image.
+/// [`Features::vectors`] of them, row after row. The seed should be that of the image.
 pub fn sample(features: &Features, count: usize, seed: Seed) -> Vec<u8> {
-    let descriptors = features.descriptors.as_chunks::<DESCRIPTOR_LEN>().0;
+    let descriptors = features.vectors();
     let mut rng = seed.rng();
     let mut wanted = count.min(descriptors.len());
     let mut sampled = Vec::with_capacity(wanted * DESCRIPTOR_LEN);

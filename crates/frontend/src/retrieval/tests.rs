@@ -1,7 +1,7 @@
 //! Vocabulary, encoding and neighbours against known groups.
 
 use super::*;
-use terrane_scene::Keypoint;
+use terrane_scene::{DescriptorKind, Keypoint};
 
 type Descriptor = [u8; DESCRIPTOR_LEN];
 
@@ -11,6 +11,7 @@ fn features(descriptors: &[Descriptor]) -> Features {
         keypoints: vec![keypoint; descriptors.len()],
         descriptors: descriptors.as_flattened().to_vec(),
         colors: vec![[0; 3]; descriptors.len()],
+        ..Features::default()
     }
 }
 
@@ -111,6 +112,44 @@ fn images_of_one_place_find_each_other() {
     for (at, list) in nearest(&descriptors, |_| true, 2, Seed(13)).into_iter().enumerate() {
         assert!(list.iter().all(|similar| similar.index as usize % 6 == at % 6), "image {at}: {list:?}");
         assert!(list.iter().all(|similar| similar.similarity > 0.3 && similar.similarity < 1.0));
+    }
+}
+
+#[test]
+fn images_of_one_place_find_each_other_by_bits() {
+    let mut rng = Seed(31).rng();
+    let bits = |seed: u64, count: usize| -> Vec<[u8; 32]> {
+        let mut rng = Seed(seed).rng();
+        (0..count).map(|_| std::array::from_fn(|_| rng.random_range(0..=255))).collect()
+    };
+    let places: Vec<Vec<[u8; 32]>> = (0..4).map(|place| bits(place, 300)).collect();
+    let images: Vec<Features> = (0..12)
+        .map(|at| {
+            let mut all = places[at % 4].clone();
+            for descriptor in &mut all {
+                for _ in 0..20 {
+                    let bit = rng.random_range(0..256_usize);
+                    descriptor[bit / 8] ^= 1 << (bit % 8);
+                }
+            }
+            all.extend(bits(50 + at as u64, 100));
+            Features {
+                kind: DescriptorKind::Bits256,
+                descriptors: all.into_flattened(),
+                ..Features::default()
+            }
+        })
+        .collect();
+    let training: Vec<u8> =
+        images.iter().enumerate().flat_map(|(at, f)| sample(f, 200, Seed(10).item(&[at as u64]))).collect();
+    let vocabulary = Vocabulary::train(&training, &options(32), Seed(11));
+    let encoded: Vec<Vec<f32>> = images.iter().map(|features| vocabulary.encode(features)).collect();
+    let projection = Projection::train(&encoded, 8, Seed(12));
+    let mut descriptors = CompactDescriptors::new(projection.dimensions());
+    encoded.iter().for_each(|values| descriptors.push(&projection.project(values)));
+    for (at, list) in nearest(&descriptors, |_| true, 2, Seed(13)).into_iter().enumerate() {
+        assert!(list.iter().all(|similar| similar.index as usize % 4 == at % 4), "image {at}: {list:?}");
+        assert!(list.iter().all(|similar| similar.similarity > 0.1), "image {at}: {list:?}");
     }
 }
 

@@ -18,12 +18,13 @@ mod octave;
 mod options;
 mod rows;
 mod select;
+pub(crate) mod shared;
 #[cfg(test)]
 mod tests;
 mod weighted;
 
 use rayon::prelude::*;
-use terrane_scene::{DESCRIPTOR_LEN, Features, Keypoint};
+use terrane_scene::{DESCRIPTOR_LEN, DescriptorKind, Features, Keypoint};
 
 use crate::Mask;
 use crate::image::{GrayImage, RgbImage};
@@ -74,7 +75,8 @@ fn extract_with(
     let keypoints: Vec<Keypoint> =
         oriented.iter().map(|(blob, orientation_rad)| blob.keypoint(options, *orientation_rad)).collect();
     let colors = keypoints.iter().map(|keypoint| color_at(keypoint, luma, rgb)).collect();
-    Features { keypoints, descriptors: descriptors.into_flattened(), colors }
+    let kind = DescriptorKind::Bytes128;
+    Features { keypoints, kind, descriptors: descriptors.into_flattened(), colors }
 }
 
 /// All octaves, finest first.

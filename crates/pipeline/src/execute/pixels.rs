@@ -1,16 +1,16 @@
 //! The stages that look at pixels and descriptors: features, pairs, match.
 
 use std::borrow::Cow;
-use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
 
 use rayon::prelude::*;
 use terrane_frontend::matching::{Match, PreparedImage, match_prepared};
 use terrane_frontend::verification::{Candidate, NotVerified, View, verify};
-use terrane_frontend::{image, pairs, sift};
+use terrane_frontend::{features as extraction, image, pairs};
 use terrane_geometry::ransac::SampleOrder;
 use terrane_scene::codec::{self, FeatureBatchWriter, MatchBlock};
-use terrane_scene::{Features, ImageId, ImagePair, ImageRecord, ImageTable, MatchedPair};
+use terrane_scene::{DescriptorKind, Features, ImageId, ImagePair, ImageRecord, ImageTable, MatchedPair};
 
 use super::inputs::{MaskFile, read_mask, read_unchanged};
 use super::read::{self, PairsInfo};
@@ -80,7 +80,8 @@ fn features_of(
     drop(bytes);
     Ok(match decoded {
         Ok(decoded) => {
-            Ok(sift::extract_masked(&decoded.luma, decoded.rgb.as_ref(), mask.as_ref(), &options.sift))
+            let (luma, rgb) = (&decoded.luma, decoded.rgb.as_ref());
+            Ok(extraction::extract_masked(luma, rgb, mask.as_ref(), &options.extraction()))
         }
         Err(error) => Err(error.to_string()),
     })
@@ -207,6 +208,12 @@ fn prepared(
     context: &ExecutionContext,
     images: &BTreeMap<ImageId, Features>,
 ) -> Result<BTreeMap<ImageId, PreparedImage>, PipelineError> {
+    let kinds: BTreeSet<DescriptorKind> =
+        images.values().filter(|features| !features.is_empty()).map(|features| features.kind).collect();
+    if kinds.len() > 1 {
+        let names: Vec<_> = kinds.iter().map(|kind| kind.name()).collect();
+        return Err(PipelineError::bug(format!("descriptors of {} can't be matched", names.join(" and "))));
+    }
     let prepare = |(image, features): (&ImageId, &Features)| {
         context.cancel.check()?;
         Ok((*image, PreparedImage::new(features, &context.config.matching.matching)))

@@ -152,7 +152,8 @@ impl<'a> Planner<'a> {
         let images = &table.table.images;
         let mut items = Vec::new();
         for (batch, chunk) in images.chunks(per_batch as usize).enumerate() {
-            let mut key = KeyBuilder::new(Stage::Features).value(options)?;
+            let read = (options.images_per_task, &options.decode, options.extraction());
+            let mut key = KeyBuilder::new(Stage::Features).value(&read)?;
             let first = ImageId(batch as u32 * per_batch);
             for (image, id) in chunk.iter().zip(first.0..) {
                 key = key.bytes(image.content_hash.as_bytes());

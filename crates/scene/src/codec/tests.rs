@@ -10,7 +10,7 @@ use terrane_geometry::{Camera, CameraModel, Rigid3, so3};
 
 use super::*;
 use crate::{
-    CameraId, ClusterId, Features, ImageFate, ImageId, ImagePair, Keypoint, MatchedPair, Observation,
+    CameraId, ClusterId, DescriptorKind, Features, ImageFate, ImageId, ImagePair, Keypoint, MatchedPair, Observation,
     PairKind, PairSummary, Reconstruction, RegisteredImage, SceneError, Submap, SubmapOutcome,
 };
 
@@ -19,6 +19,7 @@ fn features(count: u32) -> Features {
         |n: u32| Keypoint { x_px: n as f32 + 0.5, y_px: 2.5, scale_px: 1.5, orientation_rad: -0.25 };
     Features {
         keypoints: (0..count).map(keypoint).collect(),
+        kind: DescriptorKind::Bytes128,
         descriptors: (0..count * 128).map(|n| (n % 251) as u8).collect(),
         colors: (0..count).map(|n| [n as u8, 1, 2]).collect(),
     }
@@ -116,6 +117,36 @@ fn features_are_read_image_by_image() {
     assert!(reader.features(3).unwrap_err().is_corrupt());
     let unequal = Features { colors: Vec::new(), ..features(2) };
     assert!(FeatureBatchWriter::default().push(&Ok(unequal)).is_err());
+}
+
+fn binary_features(count: u32) -> Features {
+    let descriptors = (0..count * 32).map(|n| (n % 253) as u8).collect();
+    Features { kind: DescriptorKind::Bits256, descriptors, ..features(count) }
+}
+
+#[test]
+fn binary_descriptors_are_read_as_such() {
+    let mut writer = FeatureBatchWriter::default();
+    for outcome in [Ok(features(0)), Err("no".to_owned()), Ok(binary_features(7)), Ok(features(0))] {
+        writer.push(&outcome).unwrap();
+    }
+    let bytes = writer.finish().unwrap();
+    let reader = FeatureBatchReader::open(bytes.as_slice()).unwrap();
+    assert_eq!(reader.kind(), DescriptorKind::Bits256);
+    assert_eq!(reader.features(2).unwrap(), binary_features(7));
+    let empty = Features { kind: DescriptorKind::Bits256, ..Features::default() };
+    assert_eq!(reader.features(0).unwrap(), empty);
+    assert_eq!(reader.features(1).unwrap(), empty);
+}
+
+#[test]
+fn a_batch_has_descriptors_of_one_kind() {
+    let mut writer = FeatureBatchWriter::default();
+    writer.push(&Ok(features(3))).unwrap();
+    let refused = writer.push(&Ok(binary_features(3))).unwrap_err().to_string();
+    assert!(refused.contains("256 bits") && refused.contains("128 bytes"), "{refused}");
+    let mislabelled = Features { kind: DescriptorKind::Bits256, ..features(3) };
+    assert!(FeatureBatchWriter::default().push(&Ok(mislabelled)).is_err());
 }
 
 #[test]
