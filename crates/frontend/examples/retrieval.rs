@@ -147,6 +147,7 @@ fn load(bytes: &[u8]) -> Option<Features> {
         keypoints: keypoints.chunks_exact(16).map(keypoint).collect(),
         descriptors: descriptors.to_vec(),
         colors: vec![[0; 3]; len],
+        ..Features::default()
     })
 }
 

@@ -130,7 +130,8 @@ fn features(arguments: &Arguments, path: &Path, name: &str) -> Features {
         let count = bytes.len() / (size_of::<Keypoint>() + DESCRIPTOR_LEN);
         let (keypoints, descriptors) = bytes.split_at(count * size_of::<Keypoint>());
         let keypoints = bytemuck::pod_collect_to_vec(keypoints);
-        return Features { keypoints, descriptors: descriptors.to_vec(), colors: vec![[0; 3]; count] };
+        let (descriptors, colors) = (descriptors.to_vec(), vec![[0; 3]; count]);
+        return Features { keypoints, descriptors, colors, ..Features::default() };
     }
     let bytes = std::fs::read(path).expect("readable");
     let decoded = image::decode(&bytes, &image::DecodeOptions::default()).expect("an image");

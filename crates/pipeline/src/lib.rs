@@ -25,5 +25,5 @@ pub use plan::{KnownArtefacts, Plan, PlanState, RunFigures, StageProgress, plan}
 pub use stage::Stage;
 pub use store::{Put, Store};
 pub use task::{Task, TaskReport, TaskSpec};
-pub use terrane_frontend::matching::Matcher;
 pub use terrane_frontend::features::FeatureMethod;
+pub use terrane_frontend::matching::Matcher;

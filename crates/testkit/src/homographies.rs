@@ -34,7 +34,8 @@ impl Picture {
         let (x, y) = (x - 0.5, y - 0.5);
         let (column, row) = (x.floor(), y.floor());
         let (across, down) = (catmull_rom(x - column), catmull_rom(y - row));
-        let pixel = |at: f64, k: usize, len: usize| (at + k as f64 - 1.0).clamp(0.0, len as f64 - 1.0) as usize;
+        let pixel =
+            |at: f64, k: usize, len: usize| (at + k as f64 - 1.0).clamp(0.0, len as f64 - 1.0) as usize;
         let columns: [usize; 4] = std::array::from_fn(|k| pixel(column, k, self.width));
         (0..4)
             .map(|j| {
@@ -297,7 +298,8 @@ struct Mapped {
 
 impl Mapped {
     fn distance_px(&self, keypoint: &Keypoint) -> f64 {
-        (f64::from(keypoint.x_px) - self.x_px).hypot(f64::from(keypoint.y_px) - self.y_px) / self.scale.max(1.0)
+        (f64::from(keypoint.x_px) - self.x_px).hypot(f64::from(keypoint.y_px) - self.y_px)
+            / self.scale.max(1.0)
     }
 }
 
@@ -315,8 +317,8 @@ impl Places {
             let (x, y) = (f64::from(keypoint.x_px), f64::from(keypoint.y_px));
             let (x_px, y_px) = project(map, x, y);
             let (right, below) = (project(map, x + 0.5, y), project(map, x, y + 0.5));
-            let area = 4.0
-                * ((right.0 - x_px) * (below.1 - y_px) - (right.1 - y_px) * (below.0 - x_px)).abs();
+            let area =
+                4.0 * ((right.0 - x_px) * (below.1 - y_px) - (right.1 - y_px) * (below.0 - x_px)).abs();
             let scale = area.sqrt();
             let is_inside = inside(x_px, width) && inside(y_px, height);
             is_inside.then(|| Mapped { x_px, y_px, scale_px: scale * f64::from(keypoint.scale_px), scale })
@@ -362,7 +364,8 @@ fn repeated(first: &Places, second: &Places, second_features: &Features) -> usiz
         }
     }
     candidates.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)).then(a.2.cmp(&b.2)));
-    let (mut used_first, mut used_second) = (vec![false; first.mapped.len()], vec![false; second.mapped.len()]);
+    let (mut used_first, mut used_second) =
+        (vec![false; first.mapped.len()], vec![false; second.mapped.len()]);
     let mut count = 0;
     for (_, a, b) in candidates {
         if !used_first[a] && !used_second[b] {

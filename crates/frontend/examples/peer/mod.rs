@@ -21,5 +21,6 @@ pub fn read(picture: &Path) -> Features {
         keypoints: (0..count).map(keypoint).collect(),
         descriptors: bytes[8 + 16 * count..][..DESCRIPTOR_LEN * count].to_vec(),
         colors: vec![[0; 3]; count],
+        ..Features::default()
     }
 }

@@ -109,10 +109,12 @@ fn multiply_body(rows: [&[u8]; 3], out: [&mut [f32]; 3]) {
     let [xx, xy, yy] = out.map(|out| &mut out[1..=inner]);
     for x in 0..inner {
         let value = |row: &[u8], x: usize| i32::from(row[x]);
-        let dx = value(above, x + 2) - value(above, x) + 2 * (value(row, x + 2) - value(row, x))
+        let dx = value(above, x + 2) - value(above, x)
+            + 2 * (value(row, x + 2) - value(row, x))
             + value(below, x + 2)
             - value(below, x);
-        let dy = value(below, x) - value(above, x) + 2 * (value(below, x + 1) - value(above, x + 1))
+        let dy = value(below, x) - value(above, x)
+            + 2 * (value(below, x + 1) - value(above, x + 1))
             + value(below, x + 2)
             - value(above, x + 2);
         xx[x] = (dx * dx) as f32;

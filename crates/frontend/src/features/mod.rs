@@ -20,11 +20,11 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 use terrane_scene::{DescriptorKind, Features};
 
-use crate::{FrontendError, Mask};
 use crate::corners::{self, CornerDescriptor, CornerDetector, CornerOptions};
 use crate::image::{GrayImage, RgbImage};
 use crate::sift::{self, SiftOptions};
 use crate::surf::{self, SurfOptions};
+use crate::{FrontendError, Mask};
 
 /// Which features are found, and how they are described.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -49,15 +49,8 @@ pub enum FeatureMethod {
 
 impl FeatureMethod {
     /// Every method.
-    pub const ALL: [Self; 7] = [
-        Self::Sift,
-        Self::SiftUpright,
-        Self::Harris,
-        Self::Fast,
-        Self::Orb,
-        Self::Surf,
-        Self::SurfUpright,
-    ];
+    pub const ALL: [Self; 7] =
+        [Self::Sift, Self::SiftUpright, Self::Harris, Self::Fast, Self::Orb, Self::Surf, Self::SurfUpright];
 
     /// The name in options and flags.
     pub fn name(self) -> &'static str {

@@ -126,7 +126,9 @@ impl<'a> Base<'a> {
 
     fn rows(&self, columns: &Range<usize>) -> BaseRows<'a> {
         match *self {
-            Self::Photo { photo, doubled } => BaseRows::Photo(Box::new(FirstImage::new(photo, doubled, columns))),
+            Self::Photo { photo, doubled } => {
+                BaseRows::Photo(Box::new(FirstImage::new(photo, doubled, columns)))
+            }
             Self::Kept(plane) => BaseRows::Kept(plane, columns.clone()),
         }
     }
@@ -194,7 +196,10 @@ fn tiles(width: usize, tile_columns: usize) -> Vec<Tile> {
     (0..count)
         .map(|k| (k * core).min(width)..((k + 1) * core).min(width))
         .filter(|core| !core.is_empty())
-        .map(|core| Tile { columns: core.start.saturating_sub(OVERLAP)..(core.end + OVERLAP).min(width), core })
+        .map(|core| Tile {
+            columns: core.start.saturating_sub(OVERLAP)..(core.end + OVERLAP).min(width),
+            core,
+        })
         .collect()
 }
 

@@ -4,7 +4,9 @@ use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};
 use terrane_geometry::Seed;
 use terrane_geometry::two_view::essential_from_pose;
-use terrane_scene::{CameraRecord, DESCRIPTOR_LEN, Features, ImagePair, Keypoint, MatchedPair};
+use terrane_scene::{
+    CameraRecord, DESCRIPTOR_LEN, DescriptorKind, Features, ImagePair, Keypoint, MatchedPair,
+};
 
 use super::models::{self, Geometry, Guiding};
 use super::{Candidate, Correspondences, NotVerified, VerificationOptions, View};
@@ -37,7 +39,7 @@ pub struct Photograph<'a> {
 }
 
 /// Matches and verifies a pair; `first` has the lower id. As [`super::verify`] on the matches of all features, unless
-/// `options.guided` says otherwise.
+/// `options.guided` says otherwise. Binary descriptors are not guided.
 ///
 /// # Errors
 /// As [`super::verify`].
@@ -50,7 +52,11 @@ pub fn match_and_verify(
     seed: Seed,
 ) -> Result<MatchedPair, NotVerified> {
     let both = [first, second];
-    if options.guided == GuidedMatching::First
+    let guided = match both.iter().all(|side| side.features.kind == DescriptorKind::Bytes128) {
+        true => options.guided,
+        false => GuidedMatching::Off,
+    };
+    if guided == GuidedMatching::First
         && both.iter().all(|side| side.features.len() > STRONGEST)
         && let Some(found) = guided_by_strongest(pair, both, matching, options, seed)
     {
@@ -58,7 +64,7 @@ pub fn match_and_verify(
     }
     let matches = match_features(first.features, second.features, matching);
     let candidate = candidate(pair, both, &matches);
-    if options.guided == GuidedMatching::Off {
+    if guided == GuidedMatching::Off {
         return super::verify(&candidate, options, seed);
     }
     let (points, geometry) = super::geometry(&candidate, options, seed)?;
@@ -83,7 +89,7 @@ fn guided_by_strongest(
     let [first, second] = both.map(|side| Features {
         keypoints: side.features.keypoints[..STRONGEST].to_vec(),
         descriptors: side.features.descriptors[..STRONGEST * DESCRIPTOR_LEN].to_vec(),
-        colors: Vec::new(),
+        ..Features::default()
     });
     let matches = match_features(&first, &second, matching);
     let (_, geometry) = super::geometry(&candidate(pair, both, &matches), options, seed).ok()?;

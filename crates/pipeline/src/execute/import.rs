@@ -271,7 +271,7 @@ pub(super) fn features(
             Some(_) => Vec::new(),
             None => descriptors(context, &database, id, keypoints.len())?,
         };
-        found.push(Ok(Features { keypoints, descriptors, colors: Vec::new() }));
+        found.push(Ok(Features { keypoints, descriptors, ..Features::default() }));
     }
     found
         .into_par_iter()

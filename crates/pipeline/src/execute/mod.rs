@@ -10,6 +10,7 @@ mod import;
 mod import;
 mod ingest;
 mod inputs;
+mod matching;
 mod pixels;
 pub(crate) mod read;
 mod report;
@@ -143,7 +144,7 @@ fn run_stage(task: &Task, store: &Store, context: &ExecutionContext) -> Result<M
         TaskSpec::Features { table, first, count } => pixels::features(store, context, table, *first, *count),
         TaskSpec::Pairs { table, features, lost } => pixels::pairs(store, context, table, features, lost),
         TaskSpec::Match { table, pairs, block, features } => {
-            pixels::matching(store, context, (table, pairs), *block, features)
+            matching::matching(store, context, (table, pairs), *block, features)
         }
         TaskSpec::ViewGraph { num_images, matches } => {
             graph::view_graph(store, context, *num_images, matches)

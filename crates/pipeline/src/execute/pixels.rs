@@ -1,22 +1,15 @@
-//! The stages that look at pixels and descriptors: features, pairs, match.
-
-use std::borrow::Cow;
-use std::collections::btree_map::Entry;
-use std::collections::{BTreeMap, BTreeSet};
+//! The stages that look at pixels and at whole images: features and pairs.
 
 use rayon::prelude::*;
-use terrane_frontend::matching::{Match, PreparedImage, match_prepared};
-use terrane_frontend::verification::{Candidate, NotVerified, View, verify};
 use terrane_frontend::{features as extraction, image, pairs};
-use terrane_geometry::ransac::SampleOrder;
-use terrane_scene::codec::{self, FeatureBatchWriter, MatchBlock};
-use terrane_scene::{DescriptorKind, Features, ImageId, ImagePair, ImageRecord, ImageTable, MatchedPair};
+use terrane_scene::codec::{self, FeatureBatchWriter};
+use terrane_scene::{Features, ImageId, ImagePair, ImageRecord};
 
 use super::inputs::{MaskFile, read_mask, read_unchanged};
 use super::read::{self, PairsInfo};
 use super::{ExecutionContext, Made, appearance, encode_error, import};
 use crate::task::FeatureSet;
-use crate::{ArtefactKey, PipelineError, Stage, Store};
+use crate::{ArtefactKey, PipelineError, Store};
 
 /// What an image needs while its features are computed, in bytes a pixel; see `plan::predict`.
 const BYTES_PER_PIXEL: u64 = 48;
@@ -134,97 +127,4 @@ pub(super) fn pairs(
     let blocks = pairs::blocks(&chosen, &options.blocks);
     let counts = vec![("pairs", info.num_pairs), ("blocks", blocks.len() as u64)];
     Ok(Made { bytes: codec::encode_pair_blocks(&blocks, &info).map_err(encode_error)?, counts })
-}
-
-pub(super) fn matching(
-    store: &Store,
-    context: &ExecutionContext,
-    (table_key, pairs_key): (&ArtefactKey, &ArtefactKey),
-    block: u32,
-    features: &FeatureSet,
-) -> Result<Made, PipelineError> {
-    let (table, inputs) = context.ingested(store, table_key)?;
-    let (blocks, _) = read::pairs(store, pairs_key)?;
-    let pairs = blocks
-        .get(block as usize)
-        .ok_or_else(|| PipelineError::bug(format!("there is no block {block} of {} pairs", blocks.len())))?;
-    let mut images: BTreeMap<ImageId, Features> = BTreeMap::new();
-    for pair in pairs {
-        for image in [pair.first(), pair.second()] {
-            if let Entry::Vacant(vacant) = images.entry(image) {
-                vacant.insert(read::features(store, features, image)?);
-            }
-        }
-    }
-    let imported = inputs.imported_matches();
-    let imported = imported.map(|imported| import::matches(context, imported, pairs)).transpose()?;
-    let options = &context.config.matching.matching;
-    let mut verification = context.config.matching.verification.clone();
-    if imported.is_some() {
-        // No match is known to be better than another: their order says nothing.
-        verification.ransac.order = SampleOrder::Uniform;
-    }
-    let prepared = match imported {
-        Some(_) => BTreeMap::new(),
-        None => prepared(context, &images)?,
-    };
-    let seed = context.config.stage_seed(Stage::Match);
-    let verified: Vec<Result<MatchedPair, NotVerified>> = pairs
-        .par_iter()
-        .enumerate()
-        .map(|(at, pair)| {
-            context.cancel.check()?;
-            let (first, second) = (pair.first(), pair.second());
-            let matches = match &imported {
-                Some(imported) => Cow::Borrowed(imported[at].as_slice()),
-                None => Cow::Owned(match_prepared(&prepared[&first], &prepared[&second], options)),
-            };
-            let candidate = Candidate {
-                pair: *pair,
-                first: View { camera: table.camera_of(first), keypoints: &images[&first].keypoints },
-                second: View { camera: table.camera_of(second), keypoints: &images[&second].keypoints },
-                matches: &matches,
-            };
-            Ok(verify(&candidate, &verification, seed))
-        })
-        .collect::<Result<_, PipelineError>>()?;
-    let mut made = MatchBlock::default();
-    for outcome in verified {
-        match outcome {
-            Ok(pair) => made.pairs.push(pair),
-            Err(reason) => *made.refused.entry(reason_name(&reason).to_owned()).or_default() += 1,
-        }
-    }
-    let counts = vec![
-        ("pairs", pairs.len() as u64),
-        ("verified", made.pairs.len() as u64),
-        ("matches", made.pairs.iter().map(|pair| pair.matches.len() as u64).sum()),
-    ];
-    Ok(Made { bytes: codec::encode_match_block(&made).map_err(encode_error)?, counts })
-}
-
-/// Descriptors as the matcher wants them, once an image of the block.
-fn prepared(
-    context: &ExecutionContext,
-    images: &BTreeMap<ImageId, Features>,
-) -> Result<BTreeMap<ImageId, PreparedImage>, PipelineError> {
-    let kinds: BTreeSet<DescriptorKind> =
-        images.values().filter(|features| !features.is_empty()).map(|features| features.kind).collect();
-    if kinds.len() > 1 {
-        let names: Vec<_> = kinds.iter().map(|kind| kind.name()).collect();
-        return Err(PipelineError::bug(format!("descriptors of {} can't be matched", names.join(" and "))));
-    }
-    let prepare = |(image, features): (&ImageId, &Features)| {
-        context.cancel.check()?;
-        Ok((*image, PreparedImage::new(features, &context.config.matching.matching)))
-    };
-    images.par_iter().map(prepare).collect()
-}
-
-/// The reason without its numbers, to count by.
-fn reason_name(reason: &NotVerified) -> &'static str {
-    match reason {
-        NotVerified::TooFewMatches { .. } => "too_few_matches",
-        NotVerified::TooFewInliers { .. } => "too_few_inliers",
-    }
 }
