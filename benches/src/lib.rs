@@ -5,6 +5,7 @@
 
 pub mod process;
 pub mod table;
+pub mod usage;
 
 use std::path::PathBuf;
 

@@ -1,0 +1,49 @@
+//! The front end: features, matching, verification, pair selection; each beside COLMAP on the same files and machine.
+//!
+//! COLMAP is run through pycolmap by the scripts in `benches/peers`. Its results are kept in `TERRANE_PEER_CACHE` when that is set,
+//! and the rows then say that they were not measured in the same go.
+
+mod extraction;
+mod interchange;
+mod kernels;
+mod memory;
+mod peer;
+mod retrieval;
+mod sets;
+mod two_views;
+mod whole;
+
+use terrane_benches::Request;
+use terrane_benches::table::{self, Row};
+
+/// A group of figures.
+type Section = (&'static str, fn(&Request) -> anyhow::Result<Vec<Row>>);
+
+const SECTIONS: &[Section] = &[
+    ("extraction", extraction::rows),
+    ("memory", memory::rows),
+    ("kernels", kernels::rows),
+    ("two views", two_views::rows),
+    ("whole", whole::rows),
+    ("retrieval", retrieval::rows),
+    ("interchange", interchange::rows),
+];
+
+fn main() -> anyhow::Result<()> {
+    if let Some(outcome) = memory::as_child() {
+        return outcome;
+    }
+    let request = Request::from_args()?;
+    let mut rows = Vec::new();
+    for (name, section) in SECTIONS.iter().filter(|(name, _)| request.wants(name)) {
+        println!("{name}");
+        for row in section(&request)? {
+            table::print(&row);
+            rows.push(row);
+        }
+    }
+    if let Some(path) = &request.json {
+        table::write_json(path, &rows)?;
+    }
+    Ok(())
+}
