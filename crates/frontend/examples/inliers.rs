@@ -63,7 +63,10 @@ fn main() {
     ratios.sort_by(f64::total_cmp);
     let median = ratios.get(ratios.len() / 2).copied().unwrap_or(f64::NAN);
     let counts = [0, 1].map(|side| images.iter().map(|(_, f)| f[side].len()).sum::<usize>() / images.len());
-    println!("inliers {sums:?}, median ratio {median:.3} over {} pairs; features an image {counts:?}", ratios.len());
+    println!(
+        "inliers {sums:?}, median ratio {median:.3} over {} pairs; features an image {counts:?}",
+        ratios.len()
+    );
 }
 
 /// Matches of a pair and verified inliers.
@@ -76,6 +79,7 @@ fn verified(images: &[(CameraRecord, [Features; 2])], (a, b): (usize, usize), si
         second: View { camera: second_camera, keypoints: &second[side].keypoints },
         matches: &matches,
     };
-    let inliers = verify(&candidate, &VerificationOptions::default(), Seed(1)).map_or(0, |pair| pair.matches.len());
+    let inliers =
+        verify(&candidate, &VerificationOptions::default(), Seed(1)).map_or(0, |pair| pair.matches.len());
     (matches.len(), inliers)
 }

@@ -29,6 +29,7 @@ fn main() {
             "--peer" => peer_dir = Some(PathBuf::from(value())),
             "--max" => options.max_features = value().parse().expect("a number"),
             "--spread" => options.spread = value().parse().expect("a number"),
+            "--octaves" => options.num_octaves = value().parse().expect("a number"),
             "--first-octave" if value() == "-1" => options.first_octave = FirstOctave::Doubled,
             "--first-octave" => options.first_octave = FirstOctave::Original,
             _ => photos.push(PathBuf::from(argument)),
@@ -39,8 +40,9 @@ fn main() {
     for photo in &photos {
         let all = render(photo, &conditions, &pictures);
         let size = (all[0].1.width, all[0].1.height);
-        let theirs: Option<Vec<Features>> =
-            peer_dir.as_ref().map(|dir: &PathBuf| all.iter().map(|(name, _)| peer::read(&dir.join(name))).collect());
+        let theirs: Option<Vec<Features>> = peer_dir
+            .as_ref()
+            .map(|dir: &PathBuf| all.iter().map(|(name, _)| peer::read(&dir.join(name))).collect());
         // As many features a picture as the peer kept: it counts blobs, not orientations.
         let budget = |k: usize| theirs.as_ref().map_or(options.max_features, |theirs| theirs[k].len() as u32);
         let ours: Vec<Features> = all
@@ -80,7 +82,8 @@ fn render(photo: &Path, conditions: &[Condition], dir: &Path) -> Vec<(String, Gr
         decoded.get_or_init(|| {
             let bytes = std::fs::read(photo).expect("readable");
             let luma = image::decode(&bytes, &image::DecodeOptions::default()).expect("an image").luma;
-            Picture { width: luma.width, height: luma.height, pixels: luma.data }.middle(MIDDLE_PX.0, MIDDLE_PX.1)
+            Picture { width: luma.width, height: luma.height, pixels: luma.data }
+                .middle(MIDDLE_PX.0, MIDDLE_PX.1)
         })
     };
     let again = conditions.iter().chain(std::iter::once(&conditions[0])).enumerate();
@@ -129,7 +132,9 @@ impl Total {
 }
 
 fn print(conditions: &[Condition], totals: &[[Total; 2]]) {
-    println!("| condition | features shown | repeatability % | matching score % | right matches | precision % | error px |");
+    println!(
+        "| condition | features shown | repeatability % | matching score % | right matches | precision % | error px |"
+    );
     println!("|---|---|---|---|---|---|---|");
     let mut worse = 0;
     for (condition, sides) in conditions.iter().zip(totals) {
@@ -149,7 +154,12 @@ fn print(conditions: &[Condition], totals: &[[Total; 2]]) {
         let is_worse = theirs.count > 0.0
             && (ours.repeatability < theirs.repeatability || ours.matching_score < theirs.matching_score);
         worse += usize::from(is_worse);
-        println!("| {}{} | {} |", condition.name, if is_worse { " (worse)" } else { "" }, columns.join(" | "));
+        println!(
+            "| {}{} | {} |",
+            condition.name,
+            if is_worse { " (worse)" } else { "" },
+            columns.join(" | ")
+        );
     }
     println!("\nours / the peer's; {worse} of {} rows worse", conditions.len());
 }

@@ -124,7 +124,8 @@ mod tests {
     #[test]
     fn increments_blur_as_gaussians_do_what_the_image_still_holds() {
         for level in 0..5 {
-            let (from, to) = (1.6 * 2.0_f64.powf(level as f64 / 3.0), 1.6 * 2.0_f64.powf((level + 1) as f64 / 3.0));
+            let (from, to) =
+                (1.6 * 2.0_f64.powf(level as f64 / 3.0), 1.6 * 2.0_f64.powf((level + 1) as f64 / 3.0));
             let taps = Taps::increment(from, to);
             assert_eq!(taps.weights.iter().map(|w| u32::from(*w)).sum::<u32>(), 65_536);
             assert!(taps.distances.len() <= 11 && taps.radius() <= 12);

@@ -85,7 +85,12 @@ impl Detector {
         let threshold = (0.8 * self.thresholds.contrast_units).clamp(1.0, 32_767.0) as i16;
         for s in 1..=LEVELS {
             let [above, row, below] = rows[s];
-            mark_extrema(isa, &[above, row, below, rows[s - 1][1], rows[s + 1][1]], threshold, &mut self.marks);
+            mark_extrema(
+                isa,
+                &[above, row, below, rows[s - 1][1], rows[s + 1][1]],
+                threshold,
+                &mut self.marks,
+            );
             for x in marked(&self.marks, columns) {
                 if is_extremum(&rows[s - 1..=s + 1], x) {
                     found.extend(self.refine(differences, Cell { x, y, s }));
@@ -137,7 +142,8 @@ impl Detector {
             to.clamp(low, high)
         };
         let reach = Self::REACH - 1;
-        let range = |start: usize, len: usize| (start.saturating_sub(reach).max(1), (start + reach).min(len - 2));
+        let range =
+            |start: usize, len: usize| (start.saturating_sub(reach).max(1), (start + reach).min(len - 2));
         let ((low_x, high_x), (low_y, high_y)) = (range(start.x, self.width), range(start.y, self.height));
         Cell {
             x: moved(cell.x, offset[0], low_x, high_x),

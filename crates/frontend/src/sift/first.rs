@@ -51,7 +51,10 @@ impl<'a> FirstImage<'a> {
         let source = RowRing::new(padded_len, 2 * radius + 1);
         let padded = vec![0; padded_len.next_multiple_of(BLOCK)];
         let (even, odd) = match doubled {
-            true => (vec![0; columns.len().next_multiple_of(BLOCK)], vec![0; columns.len().next_multiple_of(BLOCK)]),
+            true => (
+                vec![0; columns.len().next_multiple_of(BLOCK)],
+                vec![0; columns.len().next_multiple_of(BLOCK)],
+            ),
             false => (Vec::new(), Vec::new()),
         };
         Self { photo, doubled, columns, phases, source, converted: 0, padded, even, odd }

@@ -27,8 +27,7 @@ impl Isa {
         let more = {
             use std::arch::is_x86_feature_detected as has;
             let avx2 = has!("avx2") && has!("fma");
-            let avx512 =
-                avx2 && has!("avx512f") && has!("avx512bw") && has!("avx512dq") && has!("avx512vl");
+            let avx512 = avx2 && has!("avx512f") && has!("avx512bw") && has!("avx512dq") && has!("avx512vl");
             [avx2.then_some(Self(Kind::Avx2Fma)), avx512.then_some(Self(Kind::Avx512))]
         };
         #[cfg(not(target_arch = "x86_64"))]

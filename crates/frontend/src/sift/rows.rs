@@ -95,7 +95,8 @@ mod tests {
 
     #[test]
     fn every_path_gives_the_same_bits() {
-        let long: Vec<u16> = (0..8 * BLOCK).map(|k| (k.wrapping_mul(40_503).wrapping_mul(k + 7) >> 3) as u16).collect();
+        let long: Vec<u16> =
+            (0..8 * BLOCK).map(|k| (k.wrapping_mul(40_503).wrapping_mul(k + 7) >> 3) as u16).collect();
         let signed: Vec<i16> = long.iter().map(|v| *v as i16).collect();
         let bytes: Vec<u8> = long.iter().map(|v| *v as u8).collect();
         let run = |isa: Isa| {

@@ -67,7 +67,8 @@ macro_rules! vector_path {
                 for term in terms {
                     let weight = $splat(term.weight as i16);
                     // SAFETY: both are plain bits, any are valid, and `transmute` checks the sizes.
-                    let pixels: [$vector; VECTORS] = unsafe { std::mem::transmute(*block(term, index * BLOCK)) };
+                    let pixels: [$vector; VECTORS] =
+                        unsafe { std::mem::transmute(*block(term, index * BLOCK)) };
                     for (sum, pixels) in sum.iter_mut().zip(pixels) {
                         *sum = $add(*sum, $multiply(pixels, weight));
                     }
