@@ -226,11 +226,12 @@ const BORDER_PX: f64 = 16.0;
 /// How features followed a homography.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Score {
-    /// Features of the part that both pictures show; the smaller count of the two.
+    /// Places of features in the part that both pictures show; the smaller count of the two. Features at one place and of
+    /// one scale are one: a blob with two orientations or found in two octaves gives one observation.
     pub shown: usize,
     /// Of these, those that were found in both, at the same place and scale, one to one.
     pub repeated: usize,
-    /// Matches within that part.
+    /// Matches within that part, of right ones one a place.
     pub matched: usize,
     /// Of these, those that are at the right place.
     pub correct: usize,
@@ -268,11 +269,15 @@ pub fn score(
     let shown = first_places.count().min(second_places.count());
     let mut errors_px = Vec::new();
     let mut matched = 0;
+    let mut used = std::collections::BTreeSet::new();
     for &(a, b) in matches {
         let Some(mapped) = first_places.mapped[a as usize] else { continue };
-        matched += 1;
+        let (first_place, second_place) = (first_places.place[a as usize], second_places.place[b as usize]);
         let error_px = mapped.distance_px(&second.keypoints[b as usize]);
-        if error_px <= TOLERANCE_PX {
+        if error_px > TOLERANCE_PX {
+            matched += 1;
+        } else if used.insert((false, first_place)) && used.insert((true, second_place)) {
+            matched += 1;
             errors_px.push(error_px);
         }
     }
@@ -306,8 +311,8 @@ impl Mapped {
 /// Where a picture's features should be in the other; `None` outside of it.
 struct Places {
     mapped: Vec<Option<Mapped>>,
-    /// Whether an earlier feature stands at the same place, as blobs with several orientations do.
-    is_again: Vec<bool>,
+    /// The first feature that stands at the same place and has the same scale.
+    place: Vec<usize>,
 }
 
 impl Places {
@@ -324,24 +329,20 @@ impl Places {
             is_inside.then(|| Mapped { x_px, y_px, scale_px: scale * f64::from(keypoint.scale_px), scale })
         });
         let mapped = mapped.collect();
-        let mut seen = std::collections::BTreeSet::new();
-        let key = |k: &Keypoint| [k.x_px, k.y_px, k.scale_px].map(f32::to_bits);
-        let is_again = features.keypoints.iter().map(|keypoint| !seen.insert(key(keypoint))).collect();
-        Self { mapped, is_again }
+        Self { mapped, place: first_at_place(&features.keypoints) }
     }
 
-    /// Features inside, each orientation on its own, as matching counts them.
     fn count(&self) -> usize {
-        self.mapped.iter().flatten().count()
+        self.places().count()
     }
 
     fn places(&self) -> impl Iterator<Item = (usize, &Mapped)> {
-        let all = self.mapped.iter().enumerate().filter(|(k, _)| !self.is_again[*k]);
+        let all = self.mapped.iter().enumerate().filter(|(k, _)| self.place[*k] == *k);
         all.filter_map(|(k, mapped)| Some((k, mapped.as_ref()?)))
     }
 }
 
-/// Places that were found in both pictures, nearest first and each once; scaled to the number of features.
+/// Places that were found in both pictures, nearest first and each once.
 fn repeated(first: &Places, second: &Places, second_features: &Features) -> usize {
     const CELL_PX: f64 = 8.0;
     let cell = |x: f64, y: f64| ((y / CELL_PX).floor() as i64, (x / CELL_PX).floor() as i64);
@@ -373,10 +374,32 @@ fn repeated(first: &Places, second: &Places, second_features: &Features) -> usiz
             count += 1;
         }
     }
-    let smaller = first.places().count().min(second.places().count());
-    // As a share of places, then of features, so that blobs with two orientations count alike on both sides.
-    let shown = first.count().min(second.count());
-    (count as f64 / smaller.max(1) as f64 * shown as f64).round() as usize
+    count
+}
+
+/// Of each keypoint the first one that is within a pixel and of nearly the same scale, itself if there is none before.
+fn first_at_place(keypoints: &[Keypoint]) -> Vec<usize> {
+    const SAME_PX: f32 = 1.0;
+    const SAME_SCALE: f32 = 1.2;
+    let cell = |k: &Keypoint| ((k.y_px / SAME_PX).floor() as i64, (k.x_px / SAME_PX).floor() as i64);
+    let mut grid: std::collections::BTreeMap<(i64, i64), Vec<usize>> = std::collections::BTreeMap::new();
+    let mut place = Vec::with_capacity(keypoints.len());
+    for (index, keypoint) in keypoints.iter().enumerate() {
+        let (row, column) = cell(keypoint);
+        let around = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (row + dy, column + dx)));
+        let is_same = |other: &&usize| {
+            let other = &keypoints[**other];
+            let ratio = other.scale_px / keypoint.scale_px;
+            (other.x_px - keypoint.x_px).hypot(other.y_px - keypoint.y_px) < SAME_PX
+                && (1.0 / SAME_SCALE..SAME_SCALE).contains(&ratio)
+        };
+        let first = around.filter_map(|cell| grid.get(&cell)).flatten().filter(is_same).min().copied();
+        place.push(first.unwrap_or(index));
+        if first.is_none() {
+            grid.entry((row, column)).or_default().push(index);
+        }
+    }
+    place
 }
 
 #[cfg(test)]

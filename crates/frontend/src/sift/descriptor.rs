@@ -3,8 +3,8 @@
 use terrane_scene::DESCRIPTOR_LEN;
 
 use super::gradient::{
-    CELLS, DIRECTIONS, Frame, ORIENTATION_BINS, Place, RIMMED_CELLS, ROOMY_DIRECTIONS, ROOMY_LEN,
-    gather_descriptor, gather_orientations,
+    CELLS, DIRECTIONS, Frame, Gathered, ORIENTATION_BINS, Place, RIMMED_CELLS, gather_descriptor,
+    gather_orientations,
 };
 use super::isa::Isa;
 use super::math::cos_sin;
@@ -74,22 +74,15 @@ pub(super) fn describe(isa: Isa, place: &Place<'_>, orientation_rad: f32) -> [u8
         cells_from_px: turned.map(|row| row.map(|v| (v * cells_per_px) as f32)),
         gradient: turned.map(|row| row.map(|v| v as f32)),
     };
-    let mut roomy = [0.0_f32; ROOMY_LEN];
-    gather_descriptor(isa, place, &frame, &mut roomy);
-    quantized(&folded(&roomy))
+    let mut gathered = [[0.0_f32; DIRECTIONS]; RIMMED_CELLS * RIMMED_CELLS];
+    gather_descriptor(isa, place, &frame, &mut gathered);
+    quantized(&without_rim(&gathered))
 }
 
-/// Drops the rim and folds the directions past the last onto the first.
-fn folded(roomy: &[f32; ROOMY_LEN]) -> [f32; DESCRIPTOR_LEN] {
+fn without_rim(gathered: &Gathered) -> [f32; DESCRIPTOR_LEN] {
     let mut out = [0.0; DESCRIPTOR_LEN];
-    for row in 0..CELLS {
-        for column in 0..CELLS {
-            let from = ((row + 1) * RIMMED_CELLS + column + 1) * ROOMY_DIRECTIONS;
-            let to = (row * CELLS + column) * DIRECTIONS;
-            for direction in 0..ROOMY_DIRECTIONS {
-                out[to + direction % DIRECTIONS] += roomy[from + direction];
-            }
-        }
+    for (cell, out) in out.as_chunks_mut::<DIRECTIONS>().0.iter_mut().enumerate() {
+        *out = gathered[(cell / CELLS + 1) * RIMMED_CELLS + cell % CELLS + 1];
     }
     out
 }
@@ -101,5 +94,7 @@ fn quantized(histogram: &[f32; DESCRIPTOR_LEN]) -> [u8; DESCRIPTOR_LEN] {
     }
     let clamped = histogram.map(|v| (v / length).min(CLAMP));
     let sum: f32 = clamped.iter().sum();
-    clamped.map(|v| (QUANTUM * (v / sum).sqrt()).round_ties_even() as u8)
+    // Adding it rounds to an integer, ties to even, which then stands in the low bits.
+    const MAGIC: f32 = 8_388_608.0;
+    clamped.map(|v| ((QUANTUM * (v / sum).sqrt()).min(255.0) + MAGIC).to_bits() as u8)
 }

@@ -6,8 +6,8 @@ use super::octave::Plane;
 
 /// Pixels that are turned into gradients at once.
 const LANES: usize = 8;
-/// The widest window for orientations in whole vectors: 4.5 standard deviations of at most 2.02 pixels on both sides.
-const MAX_SPAN: usize = 32;
+/// The widest window for orientations in whole vectors: 4.5 standard deviations of at most 4.04 pixels on both sides.
+const MAX_SPAN: usize = 56;
 
 /// Bins of an orientation histogram (Lowe 2004).
 pub(super) const ORIENTATION_BINS: usize = 36;
@@ -15,11 +15,11 @@ pub(super) const ORIENTATION_BINS: usize = 36;
 pub(super) const CELLS: usize = 4;
 pub(super) const DIRECTIONS: usize = 8;
 
-/// A descriptor while it is gathered: cells with a rim of one on each side, directions with room for the last one's
-/// neighbours, which fold back onto the first.
+/// A descriptor while it is gathered: cells with a rim of one on each side.
 pub(super) const RIMMED_CELLS: usize = CELLS + 2;
-pub(super) const ROOMY_DIRECTIONS: usize = DIRECTIONS + 2;
-pub(super) const ROOMY_LEN: usize = RIMMED_CELLS * RIMMED_CELLS * ROOMY_DIRECTIONS;
+
+/// Cells of a descriptor with its rim, row after row, and the directions of each.
+pub(super) type Gathered = [[f32; DIRECTIONS]; RIMMED_CELLS * RIMMED_CELLS];
 
 /// A place in a level of the scale space, in pixels of the plane.
 #[derive(Clone, Copy)]
@@ -46,7 +46,7 @@ kernel!(
 kernel!(
     /// Adds the gradients of a descriptor's window, trilinearly interpolated between cells and directions and weighted by
     /// a Gaussian of two cells.
-    gather_descriptor = gather_descriptor_body(place: &Place<'_>, frame: &Frame, histogram: &mut [f32; ROOMY_LEN])
+    gather_descriptor = gather_descriptor_body(place: &Place<'_>, frame: &Frame, histogram: &mut Gathered)
 );
 
 /// [`LANES`] gradients, without a common factor.
@@ -171,13 +171,14 @@ fn chord(frame: &Frame, dy: f32) -> (f32, f32) {
 }
 
 #[inline(always)]
-fn gather_descriptor_body(place: &Place<'_>, frame: &Frame, histogram: &mut [f32; ROOMY_LEN]) {
+fn gather_descriptor_body(place: &Place<'_>, frame: &Frame, histogram: &mut Gathered) {
     let Place { plane, x, y, .. } = *place;
     let [[a, b], [c, d]] = frame.cells_from_px;
     let per_determinant = REACH / (a * d - b * c).abs();
     let (reach_x, reach_y) = ((b.abs() + d.abs()) * per_determinant, (a.abs() + c.abs()) * per_determinant);
     let (first_column, last_column) = range(x, reach_x, plane.size.width);
     let (first_row, last_row) = range(y, reach_y, plane.size.height);
+    let mut pending = Pending::default();
     for row in first_row..=last_row {
         let dy = row as f32 - y;
         let (low, high) = chord(frame, dy);
@@ -187,15 +188,21 @@ fn gather_descriptor_body(place: &Place<'_>, frame: &Frame, histogram: &mut [f32
         while column <= high {
             let gradients = gradients(plane, column as usize, row as usize);
             let samples = Samples::new(&gradients, frame, (column as f32 - x, dy));
-            samples.scatter(((high - column + 1) as usize).min(LANES), histogram);
+            for lane in 0..((high - column + 1) as usize).min(LANES) {
+                pending.add(&samples, lane, histogram);
+            }
             column += LANES as i32;
         }
     }
+    pending.flush(histogram);
 }
 
 /// Where gradients fall in a descriptor's histogram.
 struct Samples {
-    index: [u32; LANES],
+    /// The upper left of four cells.
+    cell: [u32; LANES],
+    /// The lower of two directions.
+    direction: [u32; LANES],
     weight: [f32; LANES],
     across: [f32; LANES],
     down: [f32; LANES],
@@ -206,7 +213,9 @@ impl Samples {
     #[inline(always)]
     fn new(gradients: &Gradients, frame: &Frame, (dx, dy): (f32, f32)) -> Self {
         let zeros = [0.0_f32; LANES];
-        let mut out = Self { index: [0; LANES], weight: zeros, across: zeros, down: zeros, around: zeros };
+        let none = [0; LANES];
+        let mut out =
+            Self { cell: none, direction: none, weight: zeros, across: zeros, down: zeros, around: zeros };
         // From the middle of the window to the rim's first cell.
         const SHIFT: f32 = (RIMMED_CELLS as f32 - 1.0) / 2.0;
         const LAST: f32 = RIMMED_CELLS as f32 - 1.001;
@@ -232,27 +241,69 @@ impl Samples {
             out.across[lane] = column - column_whole;
             out.down[lane] = row - row_whole;
             out.around[lane] = turn - turn_whole;
-            let cell = row_index.wrapping_mul(RIMMED_CELLS as u32).wrapping_add(column_index);
-            out.index[lane] = cell.wrapping_mul(ROOMY_DIRECTIONS as u32).wrapping_add(turn_index);
+            out.cell[lane] = row_index.wrapping_mul(RIMMED_CELLS as u32).wrapping_add(column_index);
+            out.direction[lane] = turn_index;
         }
         out
     }
+}
+
+/// One for each direction, and the first again after the last.
+const DIRECTION_MASKS: [[f32; DIRECTIONS]; DIRECTIONS + 2] = {
+    let mut masks = [[0.0; DIRECTIONS]; DIRECTIONS + 2];
+    let mut k = 0;
+    while k < DIRECTIONS + 2 {
+        masks[k][k % DIRECTIONS] = 1.0;
+        k += 1;
+    }
+    masks
+};
+
+/// What neighbouring samples add to the same four cells, so that it waits in registers.
+#[derive(Default)]
+struct Pending {
+    cell: usize,
+    cells: [[f32; DIRECTIONS]; 4],
+}
+
+impl Pending {
+    /// The upper left cells' largest index whose four cells exist.
+    const LAST_CELL: usize = RIMMED_CELLS * RIMMED_CELLS - RIMMED_CELLS - 2;
 
     #[inline(always)]
-    fn scatter(&self, count: usize, histogram: &mut [f32; ROOMY_LEN]) {
-        const DOWN: usize = RIMMED_CELLS * ROOMY_DIRECTIONS;
-        const SPAN: usize = DOWN + ROOMY_DIRECTIONS + 2;
-        for lane in 0..count {
-            let at = (self.index[lane] as usize).min(ROOMY_LEN - SPAN);
-            let target: &mut [f32; SPAN] = histogram[at..].first_chunk_mut().expect("in range");
-            let below = self.weight[lane] * self.down[lane];
-            for (start, weight) in [(0, self.weight[lane] - below), (DOWN, below)] {
-                let right = weight * self.across[lane];
-                for (start, weight) in [(start, weight - right), (start + ROOMY_DIRECTIONS, right)] {
-                    let next = weight * self.around[lane];
-                    target[start] += weight - next;
-                    target[start + 1] += next;
-                }
+    fn add(&mut self, samples: &Samples, lane: usize, histogram: &mut Gathered) {
+        let cell = (samples.cell[lane] as usize).min(Self::LAST_CELL);
+        if cell != self.cell {
+            self.flush(histogram);
+            self.cell = cell;
+            self.cells = Default::default();
+        }
+        let direction = (samples.direction[lane] as usize).min(DIRECTIONS);
+        let far = samples.weight[lane] * samples.around[lane];
+        let near = samples.weight[lane] - far;
+        let (first, second) = (&DIRECTION_MASKS[direction], &DIRECTION_MASKS[direction + 1]);
+        let mut values = [0.0; DIRECTIONS];
+        for k in 0..DIRECTIONS {
+            values[k] = near * first[k] + far * second[k];
+        }
+        let (across, down) = (samples.across[lane], samples.down[lane]);
+        let lower_right = across * down;
+        let (upper_right, lower_left) = (across - lower_right, down - lower_right);
+        let shares = [1.0 - across - lower_left, upper_right, lower_left, lower_right];
+        for (cell, share) in self.cells.iter_mut().zip(shares) {
+            for k in 0..DIRECTIONS {
+                cell[k] = values[k].mul_add(share, cell[k]);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn flush(&self, histogram: &mut Gathered) {
+        let upper_left = self.cell;
+        let places = [0, 1, RIMMED_CELLS, RIMMED_CELLS + 1].map(|offset| upper_left + offset);
+        for (place, cell) in places.into_iter().zip(&self.cells) {
+            for k in 0..DIRECTIONS {
+                histogram[place][k] += cell[k];
             }
         }
     }

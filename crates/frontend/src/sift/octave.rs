@@ -3,9 +3,8 @@
 //! Six blurred images, five differences of neighbours, extrema in the middle three of these (Lowe 2004). No image of
 //! them is held whole: each level lives in a ring of as many rows as the next one's kernel and the search for extrema
 //! need, and a tile is so narrow that all its rings stay in the second cache. Tiles overlap by what the kernels reach, so
-//! that their number changes nothing. What stays of an octave is every second pixel of the three levels that orientations
-//! and descriptors are taken from: their blur is at least two pixels of the octave, so that half of the rows and columns
-//! hold them. The third is the first image of the next octave.
+//! that their number changes nothing. What stays of an octave is the three levels that orientations and descriptors are
+//! taken from, of the third only every second pixel, which is the first image of the next octave.
 
 use std::ops::Range;
 
@@ -30,6 +29,11 @@ pub(super) const TILE_COLUMNS: usize = 1024;
 /// Columns by which a tile reaches over its neighbours: the sum of the kernels' radii and what the search looks at.
 const OVERLAP: usize = 48;
 
+/// Of each level that is kept, every how manieth row and column. The blur of the third is more than three pixels of the
+/// octave, so that half of them hold it; with half of the others, some 2 % of the matches across a rotation were lost, for
+/// strength and direction of a gradient need twice the samples that brightness does.
+const STEPS: [usize; LEVELS] = [1, 1, 2];
+
 /// Columns and rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Size {
@@ -38,8 +42,8 @@ pub(super) struct Size {
 }
 
 impl Size {
-    fn half(self) -> Self {
-        Self { width: self.width.div_ceil(2), height: self.height.div_ceil(2) }
+    fn every(self, step: usize) -> Self {
+        Self { width: self.width.div_ceil(step), height: self.height.div_ceil(step) }
     }
 }
 
@@ -72,9 +76,11 @@ impl<T: Copy + Default> RowRing<T> {
     }
 }
 
-/// A whole image in fixed point; see `rows`.
+/// A level of an octave in fixed point; see `rows`.
 pub(super) struct Plane {
     pub size: Size,
+    /// Pixels of the octave in one of the plane.
+    pub step: usize,
     /// `width * height` values and [`Plane::SLACK`] behind them.
     pub data: Vec<u16>,
 }
@@ -83,8 +89,9 @@ impl Plane {
     /// Values behind the last row, so that kernels may read whole vectors anywhere.
     pub(super) const SLACK: usize = 64;
 
-    fn new(size: Size) -> Self {
-        Self { size, data: vec![0; size.width * size.height + Self::SLACK] }
+    fn new(octave: Size, step: usize) -> Self {
+        let size = octave.every(step);
+        Self { size, step, data: vec![0; size.width * size.height + Self::SLACK] }
     }
 
     fn row(&self, y: usize) -> &[u16] {
@@ -153,7 +160,7 @@ impl BaseRows<'_> {
 
 /// What is kept of an octave.
 pub(super) struct Octave {
-    /// Every second pixel of images 1 to [`LEVELS`].
+    /// Images 1 to [`LEVELS`].
     pub levels: Vec<Plane>,
     /// What was found in it.
     pub extrema: Vec<Extremum>,
@@ -163,12 +170,13 @@ pub(super) struct Octave {
 pub(super) fn run(isa: Isa, base: Base<'_>, thresholds: &Thresholds, tile_columns: usize) -> Octave {
     let size = base.size();
     let tiles = tiles(size.width, tile_columns);
-    let halves: Vec<Range<usize>> =
-        tiles.iter().map(|tile| tile.core.start / 2..tile.core.end.div_ceil(2)).collect();
-    let mut levels: Vec<Plane> = (0..LEVELS).map(|_| Plane::new(size.half())).collect();
+    let mut levels: Vec<Plane> = STEPS.iter().map(|&step| Plane::new(size, step)).collect();
     let mut kept: Vec<Vec<Vec<&mut [u16]>>> = tiles.iter().map(|_| Vec::with_capacity(LEVELS)).collect();
     for level in &mut levels {
-        for (kept, part) in kept.iter_mut().zip(level.columns_mut(&halves)) {
+        let step = level.step;
+        let parts: Vec<Range<usize>> =
+            tiles.iter().map(|tile| tile.core.start / step..tile.core.end.div_ceil(step)).collect();
+        for (kept, part) in kept.iter_mut().zip(level.columns_mut(&parts)) {
             kept.push(part);
         }
     }
@@ -238,7 +246,7 @@ impl<'a> Stream<'a> {
         Self { isa, height, tile, blurs, delays, images, differences, padded }
     }
 
-    /// Writes every second row and column of the core of levels 1 to [`LEVELS`] to `kept`; returns the extrema.
+    /// Writes the core of levels 1 to [`LEVELS`] to `kept`; returns the extrema.
     fn run(mut self, base: Base<'_>, thresholds: &Thresholds, kept: &mut [Vec<&mut [u16]>]) -> Vec<Extremum> {
         let Tile { columns, core } = self.tile;
         let inside = core.start - columns.start..core.end - columns.start;
@@ -253,9 +261,8 @@ impl<'a> Stream<'a> {
             for s in 1..IMAGES {
                 let Some(y) = step.checked_sub(self.delays[s]).filter(|&y| y < self.height) else { continue };
                 self.make_row(s, y);
-                if (1..=LEVELS).contains(&s) && y % 2 == 0 {
-                    let row = &self.images[s].row(y)[inside.start..(inside.end + 1) & !1];
-                    halve(self.isa, row, kept[s - 1][y / 2]);
+                if (1..=LEVELS).contains(&s) {
+                    self.keep_row(s, y, &inside, &mut kept[s - 1]);
                 }
             }
             let searched = step.checked_sub(last_delay + Detector::REACH);
@@ -264,6 +271,19 @@ impl<'a> Stream<'a> {
             }
         }
         extrema
+    }
+
+    /// Writes `columns` of row `y` of level `s` to its plane, as far as the plane has them.
+    fn keep_row(&self, s: usize, y: usize, columns: &Range<usize>, kept: &mut [&mut [u16]]) {
+        let step = STEPS[s - 1];
+        if y % step != 0 {
+            return;
+        }
+        let row = &self.images[s].row(y)[columns.start..columns.end.next_multiple_of(step)];
+        match step {
+            1 => kept[y].copy_from_slice(row),
+            _ => halve(self.isa, row, kept[y / step]),
+        }
     }
 
     /// Makes row `y` of image `s` from the image before, and of the difference of the two.
