@@ -143,7 +143,8 @@ mod tests {
         assert_eq!(resolve(&OptionFlags { seed: Some(9), ..flags(&["seed=7"]) }).unwrap().seed, 9);
         let sized = resolve(&OptionFlags { cluster_size: Some(50), ..Default::default() }).unwrap();
         assert_eq!(sized.partition.max_cluster_size, 50);
-        let matched = OptionFlags { matcher: Some(Matcher::Ann), ..flags(&["matching.matching.matcher=exact"]) };
+        let matched =
+            OptionFlags { matcher: Some(Matcher::Ann), ..flags(&["matching.matching.matcher=exact"]) };
         assert_eq!(resolve(&matched).unwrap().matching.matching.matcher, Matcher::Ann);
     }
 

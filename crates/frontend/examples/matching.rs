@@ -20,7 +20,9 @@ fn main() {
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
         match argument.as_str() {
-            "--max" => options.max_features = arguments.next().and_then(|n| n.parse().ok()).expect("a number"),
+            "--max" => {
+                options.max_features = arguments.next().and_then(|n| n.parse().ok()).expect("a number")
+            }
             _ => files.push(argument),
         }
     }

@@ -91,7 +91,9 @@ pub(super) fn nearest(
     let column_bases = second.sketches.column_bases(&first.sketches);
     let mut rows = Side::new(first, second, row_bases, &near_rows, options);
     let mut columns = Side::new(second, first, column_bases, &near_columns, options);
-    if (rows.loose.len() + columns.loose.len()) * LEAST_TIGHT > first.descriptors.len() + second.descriptors.len() {
+    if (rows.loose.len() + columns.loose.len()) * LEAST_TIGHT
+        > first.descriptors.len() + second.descriptors.len()
+    {
         return None;
     }
     if !options.mutual {

@@ -36,12 +36,7 @@ impl Measured {
 }
 
 /// The squared distance of each pair `(first, second)`, in the order of the pairs.
-pub(super) fn distances(
-    first: &Measured,
-    second: &Measured,
-    pairs: &[(u32, u32)],
-    distances: &mut Vec<i32>,
-) {
+pub(super) fn distances(first: &Measured, second: &Measured, pairs: &[(u32, u32)], distances: &mut Vec<i32>) {
     distances.clear();
     distances.reserve(pairs.len());
     #[cfg(target_arch = "x86_64")]

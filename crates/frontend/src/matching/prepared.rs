@@ -29,7 +29,9 @@ impl PreparedImage {
                 Kind::Exact { descriptors, rows, columns }
             }
             Matcher::Cascade => Kind::Cascade(Box::new(Prepared::new(paths(), descriptors))),
-            Matcher::Ann => Kind::Ann(Box::new(ann::Prepared::new(descriptors, paths().sweep != SweepPath::Scalar))),
+            Matcher::Ann => {
+                Kind::Ann(Box::new(ann::Prepared::new(descriptors, paths().sweep != SweepPath::Scalar)))
+            }
         })
     }
 
@@ -73,7 +75,5 @@ pub fn cascade_paths() -> (&'static str, &'static str) {
 
 pub(super) fn paths() -> CascadePaths {
     static PATHS: OnceLock<CascadePaths> = OnceLock::new();
-    *PATHS.get_or_init(|| {
-        CascadePaths { kernel: MatchKernel::fastest(), sweep: SweepPath::fastest() }
-    })
+    *PATHS.get_or_init(|| CascadePaths { kernel: MatchKernel::fastest(), sweep: SweepPath::fastest() })
 }

@@ -15,7 +15,8 @@ type Descriptor = [u8; DESCRIPTOR_LEN];
 fn rootsift(count: usize, seed: u64) -> Vec<Descriptor> {
     let mut rng = Seed(seed).rng();
     let mut one = || {
-        let waves: [[f32; 4]; 4] = std::array::from_fn(|_| std::array::from_fn(|_| rng.random_range(-3.0..3.0)));
+        let waves: [[f32; 4]; 4] =
+            std::array::from_fn(|_| std::array::from_fn(|_| rng.random_range(-3.0..3.0)));
         let value = |k: usize| {
             let (row, column, direction) = ((k / 32) as f32, (k / 8 % 4) as f32, (k % 8) as f32);
             let wave = |wave: &[f32; 4]| {
@@ -42,7 +43,8 @@ fn seen_again(first: &[Descriptor], seed: u64) -> Vec<Descriptor> {
     for (at, descriptor) in first.iter().enumerate().step_by(2) {
         let strength = [0.0, 4.0, 12.0, 30.0][at / 2 % 4];
         for _ in 0..1 + usize::from(at % 10 == 0) {
-            let value = |k: usize| (f32::from(descriptor[k]) + rng.random_range(-1.0..1.0) * strength).max(0.0);
+            let value =
+                |k: usize| (f32::from(descriptor[k]) + rng.random_range(-1.0..1.0) * strength).max(0.0);
             second.push(to_length_512(&std::array::from_fn(value)));
         }
     }
@@ -56,7 +58,9 @@ fn random(count: usize, limit: u8, seed: u64) -> Vec<Descriptor> {
 
 fn all_paths() -> Vec<CascadePaths> {
     let kernels = MatchKernel::available().iter();
-    kernels.flat_map(|&kernel| SweepPath::available().iter().map(move |&sweep| CascadePaths { kernel, sweep })).collect()
+    kernels
+        .flat_map(|&kernel| SweepPath::available().iter().map(move |&sweep| CascadePaths { kernel, sweep }))
+        .collect()
 }
 
 /// Matches by the cascade, which must be those of all products; whether bounds were of use.
@@ -107,7 +111,8 @@ fn cascade_is_exact_on_adversarial_descriptors() {
     odd[500] = odd[3];
     let copies = vec![typical[0]; 600];
     let few = [typical[1]; 300].into_iter().chain(typical[300..].iter().copied()).collect::<Vec<_>>();
-    let sides = [typical, odd, copies, few, random(600, 127, 6), random(600, 255, 7), vec![[9; DESCRIPTOR_LEN]; 520]];
+    let sides =
+        [typical, odd, copies, few, random(600, 127, 6), random(600, 255, 7), vec![[9; DESCRIPTOR_LEN]; 520]];
     for first in &sides {
         for second in &sides {
             assert_equal(first, second, &MatchOptions::default());
@@ -152,8 +157,11 @@ fn sketches_never_overestimate_a_distance() {
                 if row_bases[i] == LOOSE || column_bases[j] == LOOSE {
                     continue;
                 }
-                let dot: i32 =
-                    a.coarse.codes[i].iter().zip(&b.fine.codes[j]).map(|(&a, &b)| i32::from(a) * i32::from(b)).sum();
+                let dot: i32 = a.coarse.codes[i]
+                    .iter()
+                    .zip(&b.fine.codes[j])
+                    .map(|(&a, &b)| i32::from(a) * i32::from(b))
+                    .sum();
                 let excess = dot - row_bases[i] - column_bases[j];
                 let squared = scalar::distance_squared(&first[i], &second[j]) as u32;
                 assert!(excess >= -a.reach(&b, squared), "{i} {j}: {excess} against {squared}");

@@ -211,8 +211,7 @@ fn match_pair(
 ) -> Result<MatchedPair, NotVerified> {
     let options = &context.config.matching;
     let (first, second) = (&images[&pair.first()], &images[&pair.second()]);
-    let matches =
-        match_prepared(&prepared[&pair.first()], &prepared[&pair.second()], &options.matching);
+    let matches = match_prepared(&prepared[&pair.first()], &prepared[&pair.second()], &options.matching);
     let candidate = Candidate {
         pair,
         first: View { camera: table.camera_of(pair.first()), keypoints: &first.keypoints },

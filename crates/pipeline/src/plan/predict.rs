@@ -49,7 +49,8 @@ pub(super) fn pairs(num_images: usize) -> Cost {
 /// Matching: the features of the block's images, as they are and laid out for the matcher, and what one pair a thread
 /// takes.
 pub(super) fn matching(num_images: usize, num_pairs: usize, threads: u32) -> Cost {
-    let bytes = num_images as u64 * (FEATURES_BYTES * 2 + PREPARED_BYTES) + u64::from(threads) * 32 * MIB + 32 * MIB;
+    let bytes =
+        num_images as u64 * (FEATURES_BYTES * 2 + PREPARED_BYTES) + u64::from(threads) * 32 * MIB + 32 * MIB;
     Cost { bytes, seconds: 0.05 * num_pairs as f64 }
 }
 

@@ -170,12 +170,16 @@ fn pass(
             _mm256_sub_epi16(load(&starts[0]), load(&limits[0].base)),
             _mm256_sub_epi16(load(&starts[1]), load(&limits[1].base)),
         ];
-        let sums = sums(rows, blocks, [
-            lowered(start, row_limits.base[0]),
-            lowered(start, row_limits.base[1]),
-            lowered(start, row_limits.base[2]),
-            lowered(start, row_limits.base[3]),
-        ]);
+        let sums = sums(
+            rows,
+            blocks,
+            [
+                lowered(start, row_limits.base[0]),
+                lowered(start, row_limits.base[1]),
+                lowered(start, row_limits.base[2]),
+                lowered(start, row_limits.base[3]),
+            ],
+        );
         let rejected = [
             rejected(sums[0], (row_limits.least[0], row_limits.lone[0]), limits),
             rejected(sums[1], (row_limits.least[1], row_limits.lone[1]), limits),

@@ -152,7 +152,8 @@ fn pass(
             let reach = _mm512_min_epi32(reach, _mm512_set1_epi32(row_limits.reach[r]));
             let lone = _mm512_max_epi32(lone, _mm512_set1_epi32(row_limits.lone[r]));
             let reach = _mm512_max_epi32(reach, lone);
-            let least = _mm512_sub_epi32(_mm512_add_epi32(base, _mm512_set1_epi32(row_limits.base[r])), reach);
+            let least =
+                _mm512_sub_epi32(_mm512_add_epi32(base, _mm512_set1_epi32(row_limits.base[r])), reach);
             masks[r] = _mm512_cmpge_epi32_mask(dots[r], least);
             any |= masks[r];
         }
@@ -163,11 +164,7 @@ fn pass(
 }
 
 #[inline(never)]
-fn collect(
-    masks: &[u16; ROWS],
-    (first_row, first_column): (usize, usize),
-    survivors: &mut Vec<(u32, u32)>,
-) {
+fn collect(masks: &[u16; ROWS], (first_row, first_column): (usize, usize), survivors: &mut Vec<(u32, u32)>) {
     for (r, &mask) in masks.iter().enumerate() {
         let mut mask = mask;
         while mask != 0 {
