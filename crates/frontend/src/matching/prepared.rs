@@ -19,7 +19,7 @@ enum Kind {
 }
 
 impl PreparedImage {
-    /// Prepares an image for the matcher that the options name. Takes about four times the memory of the descriptors.
+    /// Prepares an image for the matcher that the options name. Takes about three times the memory of the descriptors.
     pub fn new(features: &Features, options: &MatchOptions) -> Self {
         let descriptors = features.descriptors.as_chunks::<DESCRIPTOR_LEN>().0.to_vec();
         Self(match options.matcher {
