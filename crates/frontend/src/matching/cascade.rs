@@ -258,7 +258,6 @@ fn wanted(
 /// Every pair that may be a match, among others. Tightens both sides' limits.
 fn candidates(rows: &mut Side<'_>, columns: &mut Side<'_>) -> Option<Vec<(u32, u32)>> {
     let (num_rows, num_columns) = (rows.second.len(), columns.second.len());
-    let most = num_rows * num_columns / LEAST_REJECTED;
     let (mut survivors, mut squared) = (Vec::new(), Vec::new());
     let (mut found, mut num_survivors) = (Vec::new(), 0);
     for start in (0..num_columns).step_by(CHUNK) {
@@ -269,7 +268,8 @@ fn candidates(rows: &mut Side<'_>, columns: &mut Side<'_>) -> Option<Vec<(u32, u
             &mut survivors,
         )?;
         num_survivors += survivors.len();
-        if num_survivors > most {
+        // One chunk more, since one may hold more than its share.
+        if num_survivors > num_rows * (start + 2 * CHUNK) / LEAST_REJECTED {
             return None;
         }
         distances(&rows.image.descriptors, &columns.image.descriptors, &survivors, &mut squared);
