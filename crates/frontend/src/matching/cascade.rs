@@ -19,7 +19,9 @@ use super::distance::{Measured, distances};
 use super::kernel::MatchKernel;
 use super::nearest::{Best, Nearest, Neighbour};
 use super::sketch::{Code, LOOSE, Sketches};
-use super::sweep::{ANY_REACH, CHUNK, Limits, NO_REACH, SweepColumns, SweepPath, SweepRows, sweep};
+use super::sweep::{
+    ANY_REACH, CHUNK, Limits, MOST_SURVIVORS, NO_REACH, SweepColumns, SweepPath, SweepRows, sweep,
+};
 use super::{MatchOptions, passing_ratio};
 
 /// Pairs of images with fewer products than this are not worth the bounds.
@@ -107,8 +109,8 @@ pub(super) fn nearest(
         open_columns.clear();
     }
     Some(Nearest {
-        rows: settle(paths.sweep, &rows, &mut open_rows),
-        columns: settle(paths.sweep, &columns, &mut open_columns),
+        rows: settle(paths.sweep, &rows, &mut open_rows)?,
+        columns: settle(paths.sweep, &columns, &mut open_columns)?,
     })
 }
 
@@ -223,20 +225,23 @@ fn loose(bases: &[i32]) -> Vec<u32> {
 }
 
 /// The pairs of a range of columns whose distances are wanted, each once: those that survive the sweep, and all of those
-/// whose row or column bounds nothing.
+/// whose row or column bounds nothing. `None` when there are too many.
 fn wanted(
     (sweep_rows, rows): (&SweepRows, &Limits),
     (sweep_columns, columns): (&SweepColumns, &Limits),
     range: Range<usize>,
     pairs: &mut Vec<(u32, u32)>,
-) {
+) -> Option<()> {
     pairs.clear();
     sweep((sweep_rows, rows), (sweep_columns, columns), range.clone(), pairs);
+    if pairs.len() > MOST_SURVIVORS {
+        return None;
+    }
     let loose_rows = loose(&rows.base);
     let mut loose_columns = loose(&columns.base);
     loose_columns.retain(|&column| range.contains(&(column as usize)));
     if loose_rows.is_empty() && loose_columns.is_empty() {
-        return;
+        return Some(());
     }
     let is_loose = |base: &[i32], at: u32| base[at as usize] == LOOSE;
     pairs.retain(|&(row, column)| !is_loose(&rows.base, row) && !is_loose(&columns.base, column));
@@ -247,12 +252,12 @@ fn wanted(
         let tight = (0..rows.base.len() as u32).filter(|&row| !is_loose(&rows.base, row));
         pairs.extend(tight.map(|row| (row, column)));
     }
+    Some(())
 }
 
 /// Every pair that may be a match, among others. Tightens both sides' limits.
 fn candidates(rows: &mut Side<'_>, columns: &mut Side<'_>) -> Option<Vec<(u32, u32)>> {
     let (num_rows, num_columns) = (rows.second.len(), columns.second.len());
-    let most = num_rows * num_columns / LEAST_REJECTED;
     let (mut survivors, mut squared) = (Vec::new(), Vec::new());
     let (mut found, mut num_survivors) = (Vec::new(), 0);
     for start in (0..num_columns).step_by(CHUNK) {
@@ -261,9 +266,10 @@ fn candidates(rows: &mut Side<'_>, columns: &mut Side<'_>) -> Option<Vec<(u32, u
             (&columns.image.sweep_columns, &columns.limits),
             start..num_columns.min(start + CHUNK),
             &mut survivors,
-        );
+        )?;
         num_survivors += survivors.len();
-        if num_survivors > most {
+        // One chunk more, since one may hold more than its share.
+        if num_survivors > num_rows * (start + 2 * CHUNK) / LEAST_REJECTED {
             return None;
         }
         distances(&rows.image.descriptors, &columns.image.descriptors, &survivors, &mut squared);
@@ -285,7 +291,7 @@ fn candidates(rows: &mut Side<'_>, columns: &mut Side<'_>) -> Option<Vec<(u32, u
 }
 
 /// The exact neighbours of some of a side's descriptors.
-fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Vec<Neighbour> {
+fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Option<Vec<Neighbour>> {
     open.sort_unstable();
     open.dedup();
     let everyone = |len: usize| (0..len as u32).collect::<Vec<_>>();
@@ -296,18 +302,18 @@ fn settle(path: SweepPath, side: &Side<'_>, open: &mut Vec<u32>) -> Vec<Neighbou
         neighbours[at as usize] = known[at as usize];
     }
     open.retain(|&at| !side.is_likely[at as usize]);
-    let best = all_distances(path, side, open);
+    let best = all_distances(path, side, open)?;
     for (&at, neighbour) in open.iter().zip(best.neighbours(&everyone(open.len()), &everyone(num_others))) {
         neighbours[at as usize] = neighbour;
     }
-    neighbours
+    Some(neighbours)
 }
 
 /// The two nearest of some of a side's descriptors, which become lanes.
-fn all_distances(path: SweepPath, side: &Side<'_>, open: &[u32]) -> Best {
+fn all_distances(path: SweepPath, side: &Side<'_>, open: &[u32]) -> Option<Best> {
     let mut best = Best::new(open.len());
     if open.is_empty() {
-        return best;
+        return Some(best);
     }
     let (image, other) = (side.image, side.other);
     let reach = |second: u32| image.sketches.reach(&other.sketches, second);
@@ -331,7 +337,7 @@ fn all_distances(path: SweepPath, side: &Side<'_>, open: &[u32]) -> Best {
     let (mut survivors, mut lanes, mut squared) = (Vec::new(), Vec::new(), Vec::new());
     for start in (0..num_others).step_by(CHUNK) {
         let range = start..num_others.min(start + CHUNK);
-        wanted((&rows, &limits), (&other.sweep_columns, &other_limits), range, &mut survivors);
+        wanted((&rows, &limits), (&other.sweep_columns, &other_limits), range, &mut survivors)?;
         lanes.clear();
         lanes.extend(survivors.iter().map(|&(lane, _)| lane as usize));
         survivors.iter_mut().for_each(|(lane, _)| *lane = open[*lane as usize]);
@@ -343,5 +349,5 @@ fn all_distances(path: SweepPath, side: &Side<'_>, open: &[u32]) -> Best {
             *limit = reach(side.second[open[lane] as usize].min(best.second_squared(lane)));
         }
     }
-    best
+    Some(best)
 }

@@ -20,7 +20,7 @@ enum Kind {
 }
 
 impl PreparedImage {
-    /// Prepares an image for the matcher that the options name; binary descriptors have but one. Takes about four times the
+    /// Prepares an image for the matcher that the options name; binary descriptors have but one. Takes about three times the
     /// memory of the descriptors.
     pub fn new(features: &Features, options: &MatchOptions) -> Self {
         if features.kind == DescriptorKind::Bits256 {

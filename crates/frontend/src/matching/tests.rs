@@ -12,7 +12,7 @@ fn random(count: usize, limit: u8, seed: u64) -> Vec<Descriptor> {
     (0..count).map(|_| std::array::from_fn(|_| rng.random_range(0..=limit))).collect()
 }
 
-fn features(descriptors: &[Descriptor]) -> Features {
+pub(super) fn features(descriptors: &[Descriptor]) -> Features {
     let keypoint = Keypoint { x_px: 0.5, y_px: 0.5, scale_px: 1.0, orientation_rad: 0.0 };
     Features {
         keypoints: vec![keypoint; descriptors.len()],

@@ -5,6 +5,7 @@ use super::cascade::{self, CascadePaths, Prepared};
 use super::distance::{Measured, distances};
 use super::sketch::{LOOSE, Sketches};
 use super::sweep::{ANY_REACH, Limits, NO_REACH, SweepPath, sweep};
+use super::tests::features;
 use super::*;
 use rand::RngExt;
 use terrane_geometry::Seed;
@@ -122,15 +123,6 @@ fn cascade_is_exact_on_adversarial_descriptors() {
 
 #[test]
 fn prepared_images_of_every_size_match_as_all_products_do() {
-    let features = |descriptors: &[Descriptor]| Features {
-        keypoints: vec![
-            terrane_scene::Keypoint { x_px: 0.5, y_px: 0.5, scale_px: 1.0, orientation_rad: 0.0 };
-            descriptors.len()
-        ],
-        descriptors: descriptors.as_flattened().to_vec(),
-        colors: vec![[0; 3]; descriptors.len()],
-        ..Features::default()
-    };
     let options = MatchOptions::default();
     let exact = MatchOptions { matcher: Matcher::Exact, ..options.clone() };
     let sides = [0, 1, 2, 70, 530, 1100].map(|count| features(&rootsift(count, 8)));

@@ -16,7 +16,7 @@ const MIB: u64 = 1 << 20;
 /// Bytes of features of one image at most: 8,192 of (16 + 3 + 128).
 const FEATURES_BYTES: u64 = 8192 * 147;
 /// Bytes of what a matcher lays out of it.
-const PREPARED_BYTES: u64 = 8192 * 640;
+const PREPARED_BYTES: u64 = 8192 * 400;
 
 fn pixels(table: &ImageTable, image: ImageId) -> u64 {
     let record = table.image(image);

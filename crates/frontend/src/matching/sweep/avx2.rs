@@ -8,7 +8,7 @@ use std::arch::x86_64::*;
 use std::ops::Range;
 
 use super::closest::{GUESSES, LANES, best_lanes};
-use super::{CHUNK, Limits};
+use super::{CHUNK, Limits, MOST_SURVIVORS};
 use crate::matching::sketch::{Code, SKETCH_LEN};
 
 const ROWS: usize = 4;
@@ -123,6 +123,9 @@ pub(super) fn sweep(
         };
         let from = survivors.len();
         for (strip, rows) in rows.strips.iter().enumerate() {
+            if survivors.len() > MOST_SURVIVORS {
+                return;
+            }
             let row_limits = narrow(row_limits, strip);
             // SAFETY: the processor has AVX2 (asserted).
             unsafe { pass(rows, &row_limits, strip * ROWS, &chunk, survivors) };

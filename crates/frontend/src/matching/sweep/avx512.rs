@@ -6,7 +6,7 @@
 use std::arch::x86_64::*;
 use std::ops::Range;
 
-use super::{CHUNK, Limits};
+use super::{CHUNK, Limits, MOST_SURVIVORS};
 use crate::matching::sketch::{Code, SKETCH_LEN};
 
 const ROWS: usize = 8;
@@ -110,6 +110,9 @@ pub(super) fn sweep(
             start,
         };
         for (strip, rows) in rows.strips.iter().enumerate() {
+            if survivors.len() > MOST_SURVIVORS {
+                return;
+            }
             let row_limits = near(row_limits, strip);
             // SAFETY: the processor has AVX-512 F and VNNI (asserted).
             unsafe { pass(rows, &row_limits, strip * ROWS, &chunk, survivors) };

@@ -22,6 +22,8 @@ use super::sketch::Code;
 pub(super) const CHUNK: usize = 512;
 /// Most by which a product may exceed the sum of its bases.
 pub(super) const MAX_EXCESS: i32 = 14_000;
+/// Most survivors that a sweep collects, 64 MiB of them.
+pub(super) const MOST_SURVIVORS: usize = 1 << 23;
 /// A reach beyond every bound: the pair's other side decides alone.
 pub(super) const ANY_REACH: i32 = i32::MAX;
 
@@ -120,7 +122,7 @@ impl SweepPath {
 }
 
 /// Appends the pairs `(row, column)` that survive among all rows and a range of columns, which begins at a multiple of
-/// [`CHUNK`]. Their order depends on the path.
+/// [`CHUNK`]. Their order depends on the path. Ends early, with more than [`MOST_SURVIVORS`], when there are so many.
 ///
 /// # Panics
 /// When rows and columns were laid out for different paths.

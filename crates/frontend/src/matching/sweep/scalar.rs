@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::{ANY_REACH, Limits, NO_REACH, SweepPath};
+use super::{ANY_REACH, Limits, MOST_SURVIVORS, NO_REACH, SweepPath};
 use crate::matching::sketch::{Code, SKETCH_LEN};
 
 pub(super) fn sweep(
@@ -12,6 +12,9 @@ pub(super) fn sweep(
     survivors: &mut Vec<(u32, u32)>,
 ) {
     for (row, a) in rows.iter().enumerate() {
+        if survivors.len() > MOST_SURVIVORS {
+            return;
+        }
         for column in range.clone() {
             let lone = row_limits.lone[row].max(column_limits.lone[column]);
             let reach = row_limits.reach[row].min(column_limits.reach[column]).max(lone);
