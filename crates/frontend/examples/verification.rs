@@ -252,7 +252,9 @@ fn matched_and_verified(
     let mut found = None;
     for _ in 0..repeats.max(1) {
         let start = Instant::now();
-        found = match_and_verify(pair, &first, &second, &MatchOptions::default(), options, Seed(1)).ok();
+        let matching = MatchOptions::default();
+        let match_all = || match_features(first.features, second.features, &matching);
+        found = match_and_verify(pair, [&first, &second], match_all, &matching, options, Seed(1)).ok();
         milliseconds = milliseconds.min(start.elapsed().as_secs_f64() * 1e3);
     }
     let inliers = found.iter().flat_map(|found| &found.matches);

@@ -37,27 +37,26 @@ pub struct Photograph<'a> {
     pub features: &'a Features,
 }
 
-/// Matches and verifies a pair; `first` has the lower id. As [`super::verify`] on the matches of all features, unless
-/// `options.guided` says otherwise.
+/// Matches and verifies a pair, the image with the lower id first. As [`super::verify`] on the matches of all features, which
+/// `match_all` gives, unless `options.guided` says otherwise.
 ///
 /// # Errors
 /// As [`super::verify`].
 pub fn match_and_verify(
     pair: ImagePair,
-    first: &Photograph<'_>,
-    second: &Photograph<'_>,
+    both: [&Photograph<'_>; 2],
+    match_all: impl FnOnce() -> Vec<Match>,
     matching: &MatchOptions,
     options: &VerificationOptions,
     seed: Seed,
 ) -> Result<MatchedPair, NotVerified> {
-    let both = [first, second];
     if options.guided == GuidedMatching::First
         && both.iter().all(|side| side.features.len() > STRONGEST)
         && let Some(found) = guided_by_strongest(pair, both, matching, options, seed)
     {
         return Ok(found);
     }
-    let matches = match_features(first.features, second.features, matching);
+    let matches = match_all();
     let candidate = candidate(pair, both, &matches);
     if options.guided == GuidedMatching::Off {
         return super::verify(&candidate, options, seed);

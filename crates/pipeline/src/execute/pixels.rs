@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 
 use rayon::prelude::*;
-use terrane_frontend::verification::{Candidate, NotVerified, View, verify};
+use terrane_frontend::verification::{NotVerified, Photograph, match_and_verify};
 use terrane_frontend::{image, matching, pairs, retrieval, sift};
 use terrane_geometry::Seed;
 use terrane_scene::codec::{self, FeatureBatchWriter, MatchBlock};
@@ -202,14 +202,10 @@ fn match_pair(
 ) -> Result<MatchedPair, NotVerified> {
     let options = &context.config.matching;
     let (first, second) = (&images[&pair.first()], &images[&pair.second()]);
-    let matches = matching::match_features(first, second, &options.matching);
-    let candidate = Candidate {
-        pair,
-        first: View { camera: table.camera_of(pair.first()), keypoints: &first.keypoints },
-        second: View { camera: table.camera_of(pair.second()), keypoints: &second.keypoints },
-        matches: &matches,
-    };
-    verify(&candidate, &options.verification, seed)
+    let side = |image: ImageId| Photograph { camera: table.camera_of(image), features: &images[&image] };
+    let both = [&side(pair.first()), &side(pair.second())];
+    let match_all = || matching::match_features(first, second, &options.matching);
+    match_and_verify(pair, both, match_all, &options.matching, &options.verification, seed)
 }
 
 /// The reason without its numbers, to count by.

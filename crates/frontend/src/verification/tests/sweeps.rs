@@ -1,6 +1,7 @@
 //! Rates of success over kinds of scenes, shares of outliers and errors of the focal length, with bounds on both sides.
 
 use super::*;
+use crate::matching::match_features;
 
 const CASES: u64 = 8;
 
@@ -154,7 +155,9 @@ fn guidance_finds_what_the_ratio_test_refused() {
         let pair = ImagePair::new(ImageId(0), ImageId(1)).expect("two images");
         let side = |features| Photograph { camera: &camera, features };
         let matching = MatchOptions::default();
-        match_and_verify(pair, &side(&first), &side(&second), &matching, &options, Seed(5)).expect("verified")
+        let match_all = || match_features(&first, &second, &matching);
+        match_and_verify(pair, [&side(&first), &side(&second)], match_all, &matching, &options, Seed(5))
+            .expect("verified")
     };
     let (plain, guided) = (found(GuidedMatching::Off), found(GuidedMatching::After));
     let right = guided.matches.iter().filter(|pair| pair[0] == pair[1]).count();
