@@ -1,6 +1,8 @@
 //! Verifies the pairs of a folder of photographs and prints what that costs and finds:
-//! `verification [--camera MODEL:params] [--max-pairs N] [--cache DIR] [--export DIR] [--repeats N] [--pairs] FOLDER`.
+//! `verification [--camera MODEL:params] [--max-pairs N] [--cache DIR] [--export DIR] [--repeats N] [--pairs]
+//! [--guided off|after|first] FOLDER`.
 //!
+//! With `--guided` each pair is matched and verified in one step, which is what is then timed.
 //! All pairs are matched, or the ten nearest by position where there are more than forty photographs. `--cache` keeps
 //! features and matches from one call to the next; `--export` writes cameras, keypoints, matches and inliers as text, for
 //! `benches/peers/colmap_verification.py`. For measuring while the front end is worked on; the benches hold the figures
@@ -15,7 +17,9 @@ use rayon::prelude::*;
 use terrane_frontend::cameras::{self, GivenCamera};
 use terrane_frontend::matching::{Match, MatchOptions, match_features};
 use terrane_frontend::metadata::{self, ImageMetadata};
-use terrane_frontend::verification::{Candidate, VerificationOptions, View, verify};
+use terrane_frontend::verification::{
+    Candidate, GuidedMatching, Photograph as Side, VerificationOptions, View, match_and_verify, verify,
+};
 use terrane_frontend::{image, sift};
 use terrane_geometry::Seed;
 use terrane_scene::{
@@ -30,6 +34,7 @@ struct Arguments {
     export: Option<PathBuf>,
     repeats: u32,
     lists_pairs: bool,
+    guided: Option<GuidedMatching>,
 }
 
 struct Photograph {
@@ -51,13 +56,21 @@ fn main() {
     let arguments = arguments();
     let (photographs, metadata) = photographs(&arguments);
     let pairs = thinned(pairs(&metadata), arguments.max_pairs);
-    let matched: Vec<(ImagePair, Vec<Match>)> =
-        pairs.par_iter().map(|&pair| (pair, matches(&arguments, &photographs, pair))).collect();
-    let options = VerificationOptions::default();
-    let verified: Vec<Verified> = matched
-        .into_iter()
-        .map(|(pair, matches)| verified(&photographs, pair, matches, &options, arguments.repeats))
-        .collect();
+    let guided = arguments.guided.unwrap_or_default();
+    let options = VerificationOptions { guided, ..VerificationOptions::default() };
+    let verified: Vec<Verified> = if arguments.guided.is_some() {
+        pairs
+            .iter()
+            .map(|&pair| matched_and_verified(&photographs, pair, &options, arguments.repeats))
+            .collect()
+    } else {
+        let matched: Vec<(ImagePair, Vec<Match>)> =
+            pairs.par_iter().map(|&pair| (pair, matches(&arguments, &photographs, pair))).collect();
+        matched
+            .into_iter()
+            .map(|(pair, matches)| verified(&photographs, pair, matches, &options, arguments.repeats))
+            .collect()
+    };
     if arguments.lists_pairs {
         verified.iter().for_each(|of| println!("{}", line_of(&photographs, of)));
     }
@@ -76,6 +89,7 @@ fn arguments() -> Arguments {
         export: None,
         repeats: 3,
         lists_pairs: false,
+        guided: None,
     };
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
@@ -87,6 +101,13 @@ fn arguments() -> Arguments {
             "--export" => found.export = Some(value().into()),
             "--repeats" => found.repeats = value().parse().expect("a number"),
             "--pairs" => found.lists_pairs = true,
+            "--guided" => {
+                found.guided = Some(match value().as_str() {
+                    "after" => GuidedMatching::After,
+                    "first" => GuidedMatching::First,
+                    _ => GuidedMatching::Off,
+                })
+            }
             _ => found.folder = argument.into(),
         }
     }
@@ -213,6 +234,32 @@ fn verified(
         found = verify(&candidate, options, Seed(1)).ok();
         milliseconds = milliseconds.min(start.elapsed().as_secs_f64() * 1e3);
     }
+    Verified { pair, found, milliseconds, matches }
+}
+
+/// Both steps as one; the matches are the inliers.
+fn matched_and_verified(
+    photographs: &[Photograph],
+    pair: ImagePair,
+    options: &VerificationOptions,
+    repeats: u32,
+) -> Verified {
+    let side = |image: ImageId| {
+        let photograph = &photographs[image.index()];
+        Side { camera: &photograph.camera, features: &photograph.features }
+    };
+    let (first, second) = (side(pair.first()), side(pair.second()));
+    let mut milliseconds = f64::INFINITY;
+    let mut found = None;
+    for _ in 0..repeats.max(1) {
+        let start = Instant::now();
+        let matching = MatchOptions::default();
+        let match_all = || match_features(first.features, second.features, &matching);
+        found = match_and_verify(pair, [&first, &second], match_all, &matching, options, Seed(1)).ok();
+        milliseconds = milliseconds.min(start.elapsed().as_secs_f64() * 1e3);
+    }
+    let inliers = found.iter().flat_map(|found| &found.matches);
+    let matches = inliers.map(|&[first, second]| Match { first, second, ratio: 0.0 }).collect();
     Verified { pair, found, milliseconds, matches }
 }
 

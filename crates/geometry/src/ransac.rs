@@ -68,6 +68,11 @@ pub trait Estimator {
         self.refine(model)
     }
 
+    /// A refinement that lowers the cost by a smaller share is the last. Default 1e-6: rounding.
+    fn min_gain(&self) -> f64 {
+        1e-6
+    }
+
     /// The data within the threshold of a model, ascending.
     fn inliers(&self, model: &Self::Model) -> Vec<u32>;
 }
@@ -219,8 +224,6 @@ fn optimise<E: Estimator>(
     estimator: &E,
     refine: impl Fn(&E, &E::Model) -> Option<E::Model>,
 ) -> (E::Model, Score) {
-    /// Gains below this share are not worth another round.
-    const MIN_GAIN: f64 = 1e-3;
     let mut best = start;
     for _ in 0..rounds {
         let Some(model) = refine(estimator, &best.0) else { break };
@@ -229,7 +232,7 @@ fn optimise<E: Estimator>(
         if !(gained > 0.0) {
             break;
         }
-        let done = gained < MIN_GAIN * best.1.cost;
+        let done = gained < estimator.min_gain() * best.1.cost;
         best = (model, score);
         if done {
             break;

@@ -128,6 +128,15 @@ impl Correspondences {
         (0..self.len()).filter(agrees).map(|i| i as u32).collect()
     }
 
+    /// Mean squared error of these under a matrix on the plane z = 1, as a share of the squared threshold; infinite for none.
+    pub(super) fn mean_squared_error(&self, matrix: &Matrix3<f64>, indices: &[u32]) -> f64 {
+        let error =
+            |&i: &u32| squared_sampson_error(matrix, &self.first[i as usize], &self.second[i as usize]);
+        let sum: f64 = indices.iter().map(error).sum();
+        let share = sum / (indices.len() as f64 * self.threshold * self.threshold);
+        if share.is_finite() { share } else { f64::INFINITY }
+    }
+
     /// Correspondences that agree with a matrix in pixels, ascending.
     pub(super) fn within_px(&self, matrix: &Matrix3<f64>) -> Vec<u32> {
         let limit = self.threshold_px * self.threshold_px;

@@ -22,7 +22,8 @@ pub enum GuidedMatching {
     Off,
     /// After all were compared with all and the pair was verified.
     After,
-    /// In place of comparing all with all, where the [`STRONGEST`] features of each image verify the pair.
+    /// In place of comparing all with all, where the strongest features ([`STRONGEST`] of each image) verify the pair;
+    /// elsewhere after it.
     First,
 }
 
@@ -38,20 +39,19 @@ pub struct Photograph<'a> {
     pub features: &'a Features,
 }
 
-/// Matches and verifies a pair; `first` has the lower id. As [`super::verify`] on the matches of all features, unless
-/// `options.guided` says otherwise. Binary descriptors are not guided.
+/// Matches and verifies a pair, the image with the lower id first. As [`super::verify`] on the matches of all features, which
+/// `match_all` gives, unless `options.guided` says otherwise. Binary descriptors are not guided.
 ///
 /// # Errors
 /// As [`super::verify`].
 pub fn match_and_verify(
     pair: ImagePair,
-    first: &Photograph<'_>,
-    second: &Photograph<'_>,
+    both: [&Photograph<'_>; 2],
+    match_all: impl FnOnce() -> Vec<Match>,
     matching: &MatchOptions,
     options: &VerificationOptions,
     seed: Seed,
 ) -> Result<MatchedPair, NotVerified> {
-    let both = [first, second];
     let guided = match both.iter().all(|side| side.features.kind == DescriptorKind::Bytes128) {
         true => options.guided,
         false => GuidedMatching::Off,
@@ -62,7 +62,7 @@ pub fn match_and_verify(
     {
         return Ok(found);
     }
-    let matches = match_features(first.features, second.features, matching);
+    let matches = match_all();
     let candidate = candidate(pair, both, &matches);
     if guided == GuidedMatching::Off {
         return super::verify(&candidate, options, seed);

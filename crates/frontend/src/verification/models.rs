@@ -20,6 +20,10 @@ const MAX_PLANAR_SAMPLED: usize = 300;
 /// With this share of the matches an essential matrix is settled, unless a fundamental matrix near it explains clearly more.
 const SETTLED_SHARE: f64 = 0.4;
 
+/// Mean squared error of inliers, as a share of the squared threshold, up to which it is that of noise; spread evenly over the
+/// range it is a third.
+const NOISE_SHARE: f64 = 0.12;
+
 /// Trusted intrinsics are not given up for a fundamental matrix with less than this share of the matches.
 const MIN_FUNDAMENTAL_SHARE: f64 = 0.5;
 
@@ -120,8 +124,10 @@ fn by_trusted_cameras(points: &Correspondences, options: &VerificationOptions, s
         by_essential.len() as f64 >= options.min_essential_share * by_fundamental.len() as f64
     };
     let start = essential.and_then(|e| points.in_pixels(&e));
-    // Near an essential matrix that holds, no fundamental matrix explains clearly more; near one that does not, it does.
-    let is_likely = by_essential.len() as f64 >= SETTLED_SHARE * points.len() as f64;
+    // Near an essential matrix that holds, no fundamental matrix explains clearly more. One for wrong intrinsics leaves errors
+    // all over the range, not those of noise, and nothing better may lie near it.
+    let is_likely = by_essential.len() as f64 >= SETTLED_SHARE * points.len() as f64
+        && essential.is_some_and(|e| points.mean_squared_error(&e, &by_essential) < NOISE_SHARE);
     let near = start.filter(|_| is_likely).and_then(|start| sample.near_fundamental(points, &start));
     let by_near = near.map(|f| points.within_px(&f)).unwrap_or_default();
     if near.is_some() && is_settled(&by_near) {

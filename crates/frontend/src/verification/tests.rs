@@ -1,10 +1,14 @@
 //! Kinds, inliers and poses against known two-view scenes.
 
+mod sweeps;
+
 use super::*;
 use nalgebra::{UnitQuaternion, Vector2, Vector3};
 use rand::RngExt;
 use terrane_geometry::{Camera, CameraModel, Rigid3, so3};
-use terrane_scene::{FocalSource, ImageId, PairKind};
+use terrane_scene::{Features, FocalSource, ImageId, PairKind};
+
+use crate::matching::MatchOptions;
 
 const WIDTH: u32 = 1200;
 const HEIGHT: u32 = 900;
@@ -49,7 +53,18 @@ impl Scene {
         depth: impl Fn(f64, f64, f64) -> f64,
         seed: u64,
     ) -> Self {
-        let camera = record(1000.0, FocalSource::Given).camera;
+        Self::observed_at(1000.0, count, second_from_first, depth, seed)
+    }
+
+    /// The same with a focal length.
+    fn observed_at(
+        focal_px: f64,
+        count: usize,
+        second_from_first: &Rigid3,
+        depth: impl Fn(f64, f64, f64) -> f64,
+        seed: u64,
+    ) -> Self {
+        let camera = record(focal_px, FocalSource::Given).camera;
         let mut rng = Seed(seed).rng();
         let mut scene = Self::default();
         while scene.first.len() < count {

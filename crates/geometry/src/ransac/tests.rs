@@ -1,5 +1,6 @@
 //! The loop, with a mock whose models are integers: data vote for the integer that they are.
 
+use super::sampler::below;
 use super::*;
 use crate::test_support::Random;
 

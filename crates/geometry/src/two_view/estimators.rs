@@ -76,6 +76,10 @@ macro_rules! compare_by {
             })
         }
 
+        fn min_gain(&self) -> f64 {
+            1e-3
+        }
+
         fn refine(&self, model: &Self::Model) -> Option<Self::Model> {
             self.refined(model, FULL)
         }

@@ -1,13 +1,12 @@
 //! The match stage: a block of pairs, whose images are read and prepared once.
 
-use std::borrow::Cow;
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 
 use rayon::prelude::*;
 use terrane_frontend::matching::{Match, PreparedImage, match_prepared};
 use terrane_frontend::verification::{
-    Candidate, GuidedMatching, NotVerified, Photograph, VerificationOptions, View, match_and_verify, verify,
+    GuidedMatching, NotVerified, Photograph, VerificationOptions, match_and_verify,
 };
 use terrane_geometry::Seed;
 use terrane_geometry::ransac::SampleOrder;
@@ -77,12 +76,11 @@ struct Matcher<'a> {
     context: &'a ExecutionContext,
     table: &'a ImageTable,
     images: &'a BTreeMap<ImageId, Features>,
-    /// Empty where nothing is compared with all: imported matches, guided search.
+    /// Empty where matches are imported.
     prepared: BTreeMap<ImageId, PreparedImage>,
     /// By place in the block.
     imported: Option<Vec<Vec<Match>>>,
     verification: VerificationOptions,
-    is_guided: bool,
     seed: Seed,
 }
 
@@ -97,36 +95,27 @@ impl<'a> Matcher<'a> {
         if imported.is_some() {
             // No match is known to be better than another: their order says nothing.
             verification.ransac.order = SampleOrder::Uniform;
+            verification.guided = GuidedMatching::Off;
         }
-        let is_guided = imported.is_none() && verification.guided != GuidedMatching::Off;
-        let prepared = match imported.is_some() || is_guided {
-            true => BTreeMap::new(),
-            false => prepared(context, images)?,
+        let prepared = match &imported {
+            Some(_) => BTreeMap::new(),
+            None => prepared(context, images)?,
         };
         let seed = context.config.stage_seed(Stage::Match);
-        Ok(Self { context, table, images, prepared, imported, verification, is_guided, seed })
+        Ok(Self { context, table, images, prepared, imported, verification, seed })
     }
 
     /// The pair at a place of the block.
     fn verified(&self, at: usize, pair: ImagePair) -> Result<MatchedPair, NotVerified> {
         let options = &self.context.config.matching.matching;
-        let ends = [pair.first(), pair.second()];
-        if self.is_guided {
-            let [first, second] = ends.map(|image| Photograph {
-                camera: self.table.camera_of(image),
-                features: &self.images[&image],
-            });
-            return match_and_verify(pair, &first, &second, options, &self.verification, self.seed);
-        }
-        let matches = match &self.imported {
-            Some(imported) => Cow::Borrowed(imported[at].as_slice()),
-            None => Cow::Owned(match_prepared(&self.prepared[&ends[0]], &self.prepared[&ends[1]], options)),
+        let side =
+            |image: ImageId| Photograph { camera: self.table.camera_of(image), features: &self.images[&image] };
+        let both = [&side(pair.first()), &side(pair.second())];
+        let match_all = || match &self.imported {
+            Some(imported) => imported[at].clone(),
+            None => match_prepared(&self.prepared[&pair.first()], &self.prepared[&pair.second()], options),
         };
-        let [first, second] = ends.map(|image| View {
-            camera: self.table.camera_of(image),
-            keypoints: &self.images[&image].keypoints,
-        });
-        verify(&Candidate { pair, first, second, matches: &matches }, &self.verification, self.seed)
+        match_and_verify(pair, both, match_all, options, &self.verification, self.seed)
     }
 }
 
