@@ -3,7 +3,7 @@
 
 usage: colmap_pairs.py IMAGES DATABASE OUT [--neighbours N] [--min-inliers N] [--threads N]
 
-Features and matches are kept in DATABASE, so that a second run only reads it. Photographs with GPS are matched with
+Features and matches are kept in DATABASE: a run that was stopped goes on where it was, a second one only reads. Photographs with GPS are matched with
 their N nearest (as the crow flies, heights ignored), those without with all. OUT gets a line for each verified pair:
 two names and the number of inliers, tab-separated, most inliers first.
 """
@@ -55,7 +55,6 @@ def main():
     pycolmap.logging.minloglevel = 2
     done = arguments.database.with_suffix(".done")
     if not done.exists():
-        arguments.database.unlink(missing_ok=True)
         build(arguments)
         done.touch()
     rows = verified(arguments)

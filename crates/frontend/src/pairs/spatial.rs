@@ -106,7 +106,8 @@ fn typical_reach_m(lists: &[(usize, Vec<(f64, usize)>)]) -> Option<f64> {
 /// Whether a receiver had a fix: those without one write zeros.
 pub(super) fn is_position(gps: &GpsPrior) -> bool {
     let (latitude, longitude) = (gps.latitude_deg, gps.longitude_deg);
-    latitude.abs() <= 90.0 && longitude.abs() <= 360.0 && !(latitude == 0.0 && longitude == 0.0)
+    let has_fix = latitude != 0.0 || longitude != 0.0;
+    has_fix && latitude.abs() <= 90.0 && longitude.abs() <= 360.0
 }
 
 /// Where an image was taken, on the surface of the WGS 84 ellipsoid, earth-centred in metres.

@@ -42,8 +42,8 @@ const PROPOSERS: usize = 16;
 const OWN_VOTE: u32 = 4;
 /// New candidates of an image in a round.
 const MAX_PROPOSED: usize = 30;
-/// Images whose sketches are in memory together: some 80 MiB.
-const IMAGES_AT_ONCE: u32 = 2048;
+/// Images whose sketches are in memory together: some 70 MiB.
+const IMAGES_AT_ONCE: u32 = 1024;
 
 /// Orders candidates by local agreement, with further ones found on the way. `initial` are the most similar images of each
 /// image, best first; `load` gives an image's sketch and may be called several times. Lists hold at most `count`, those

@@ -42,10 +42,10 @@ pub(super) fn features(table: &ImageTable, first: ImageId, count: u32, threads: 
 }
 
 /// Pairs: the table and its pairs; with retrieval also what is learnt from (64 MiB and its products), the features of some
-/// images, sketches of 2,048, and an image's descriptor and candidates.
+/// images, sketches of 1,024, and an image's descriptor and candidates.
 pub(super) fn pairs(num_images: usize) -> Cost {
-    let sketches = num_images.min(2048) as u64 * 48 * 1024;
-    Cost { bytes: 192 * MIB + sketches + num_images as u64 * 6_000, seconds: 0.02 * num_images as f64 }
+    let sketches = num_images.min(1024) as u64 * 72 * 1024;
+    Cost { bytes: 192 * MIB + sketches + num_images as u64 * 7_000, seconds: 0.02 * num_images as f64 }
 }
 
 /// Matching: the features of the block's images, as they are and laid out for the matcher, and what one pair a thread
