@@ -234,7 +234,7 @@ impl TiffWriter {
     }
 }
 
-fn pack(compression: Compression, raw: &[u8]) -> Vec<u8> {
+pub(super) fn pack(compression: Compression, raw: &[u8]) -> Vec<u8> {
     match compression {
         Compression::None => raw.to_vec(),
         Compression::PackBits => pack_bits(raw),
