@@ -18,7 +18,7 @@ fn hunt(specimens: &[Specimen], executions: u64, read: impl Fn(&[u8])) {
     let mutator = Mutator::new(specimens, files::words(), 4096);
     for seed in 0..executions {
         let (index, mut bytes) = mutator.variant(seed);
-        if seed % 4 != 0 && bytes.starts_with(b"\x89PNG") {
+        if !seed.is_multiple_of(4) && bytes.starts_with(b"\x89PNG") {
             files::mend_png(&mut bytes);
         }
         let (outcome, peak) =

@@ -208,7 +208,7 @@ fn tiffs() -> Vec<Specimen> {
             let len = bytes.len();
             // The directory stands behind the pixels.
             let tail = len.saturating_sub(260);
-            Specimen { name: format!("tiff {name}"), bytes, hot: vec![0..16, tail..len] }
+            Specimen { name: format!("tiff {name}"), bytes, hot: vec![(0, 16), (tail, len)] }
         })
         .collect()
 }
@@ -224,7 +224,7 @@ pub fn exif_specimens() -> Vec<Specimen> {
         let mut specimen = jpeg(&format!("exif {name}"), ColorType::Luma, |encoder| {
             let _ = encoder.add_app_segment(1, segment);
         });
-        specimen.hot = vec![20..20 + block.len() + 10];
+        specimen.hot = vec![(20, 20 + block.len() + 10)];
         all.push(specimen);
         all.push(png_with_exif(&block, name));
     }
@@ -242,7 +242,7 @@ pub fn exif_specimens() -> Vec<Specimen> {
         all.push(Specimen {
             name: format!("tiff with exif, big {big}"),
             bytes,
-            hot: vec![len.saturating_sub(300)..len],
+            hot: vec![(len.saturating_sub(300), len)],
         });
     }
     all
@@ -258,7 +258,7 @@ fn png_with_exif(block: &[u8], name: &str) -> Specimen {
     bytes.extend([0; 4]);
     bytes.extend(plain.get(33..).unwrap_or_default());
     mend_png(&mut bytes);
-    Specimen { name: format!("png exif {name}"), bytes, hot: vec![33..41 + block.len()] }
+    Specimen { name: format!("png exif {name}"), bytes, hot: vec![(33, 41 + block.len())] }
 }
 
 fn exif_block(little_endian: bool) -> Vec<u8> {
@@ -343,7 +343,7 @@ pub fn xmp_specimens() -> Vec<Specimen> {
                 let _ = encoder.add_app_segment(1, segment);
                 let _ = encoder.add_app_segment(1, exif.clone());
             });
-            specimen.hot = vec![20..20 + len + 10];
+            specimen.hot = vec![(20, 20 + len + 10)];
             specimen
         })
         .collect()
