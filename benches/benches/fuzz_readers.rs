@@ -172,22 +172,35 @@ fn hunt(target: &str, executions: u64, seconds: f64, request: &Request) -> Tally
 fn execute(target: &str, mutator: &Mutator<'_>, specimens: &[Specimen], seed: u64, tally: &mut Tally) {
     let (index, mut bytes) = mutator.variant(seed);
     // Three of four PNG get right checksums, so that what lies behind them is reached.
-    if seed % 4 != 0 && bytes.starts_with(b"\x89PNG") {
+    if !seed.is_multiple_of(4) && bytes.starts_with(b"\x89PNG") {
         files::mend_png(&mut bytes);
     }
     let name = &specimens[index].name;
     let before = PANICS.with(Cell::get);
-    let started = Instant::now();
-    let (outcome, peak) = peak_bytes(|| {
-        std::panic::catch_unwind(|| match target {
-            "image" => image::decode(&bytes, &OPTIONS).is_ok(),
-            _ => metadata::read(&bytes).is_ok_and(|metadata| metadata.make.is_some()),
-        })
-    });
-    tally.slowest_s = tally.slowest_s.max(started.elapsed().as_secs_f64());
+    let read = || {
+        let started = Instant::now();
+        let (outcome, peak) = peak_bytes(|| {
+            std::panic::catch_unwind(|| match target {
+                "image" => image::decode(&bytes, &OPTIONS).is_ok(),
+                _ => metadata::read(&bytes).is_ok_and(|metadata| metadata.make.is_some()),
+            })
+        });
+        (outcome, peak, started.elapsed().as_secs_f64())
+    };
+    let (outcome, peak, mut seconds) = read();
+    let panics = PANICS.with(Cell::get) - before;
+    // A machine that does something else in between is no finding: what is slow is read again.
+    for _ in 0..3 {
+        if seconds > 0.1 {
+            seconds = seconds.min(read().2);
+        }
+    }
+    if seconds > 1.0 {
+        println!("{target} {seed} ({name}): {} bytes take {seconds:.2} s", bytes.len());
+    }
+    tally.slowest_s = tally.slowest_s.max(seconds);
     tally.executions += 1;
     tally.peak_bytes = tally.peak_bytes.max(peak);
-    let panics = PANICS.with(Cell::get) - before;
     match outcome {
         Ok(read) => {
             tally.read += u64::from(read);

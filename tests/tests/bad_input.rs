@@ -106,6 +106,9 @@ fn broken_files_are_listed_one_by_one_and_the_run_goes_on() {
         b"\0\0\0\0IEND\xae\x42\x60\x82",
     ];
     scratch.add("one_pixel.png", &one_pixel.concat());
+    scratch.add("phone.jpg", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic");
+    scratch.add("raw.tif", b"II\x2a\0\x10\0\0\0CR\x02\0\0\0\0\0");
+    scratch.add("web.png", b"RIFF\x24\0\0\0WEBPVP8 ");
     expect(&scratch.run(), 0, &[]);
     let report = scratch.report();
     assert_eq!(report["images"]["registered"], 4, "{report:#}");
@@ -114,6 +117,13 @@ fn broken_files_are_listed_one_by_one_and_the_run_goes_on() {
         let entry = left_out.iter().find(|entry| entry["path"] == name);
         let reason = entry.and_then(|entry| entry["reason"].as_str()).unwrap_or_default();
         assert!(!reason.is_empty(), "{name} is not listed with a reason: {left_out:#?}");
+    }
+    for (name, format, remedy) in
+        [("phone.jpg", "HEIC", "convert"), ("raw.tif", "CR2", "develop"), ("web.png", "WebP", "convert")]
+    {
+        let entry = left_out.iter().find(|entry| entry["path"] == name);
+        let reason = entry.and_then(|entry| entry["reason"].as_str()).unwrap_or_default();
+        assert!(reason.contains(format) && reason.contains(remedy), "{name}: {reason}");
     }
 }
 

@@ -18,7 +18,7 @@ fn hunt(specimens: &[Specimen], executions: u64, read: impl Fn(&[u8])) {
     let mutator = Mutator::new(specimens, files::words(), 4096);
     for seed in 0..executions {
         let (index, mut bytes) = mutator.variant(seed);
-        if seed % 4 != 0 && bytes.starts_with(b"\x89PNG") {
+        if !seed.is_multiple_of(4) && bytes.starts_with(b"\x89PNG") {
             files::mend_png(&mut bytes);
         }
         let (outcome, peak) =
@@ -33,7 +33,7 @@ fn hunt(specimens: &[Specimen], executions: u64, read: impl Fn(&[u8])) {
 fn specimens_are_read() {
     for specimen in files::image_specimens() {
         let outcome = image::decode(&specimen.bytes, &OPTIONS);
-        assert!(outcome.is_ok() || specimen.name == "png interlaced", "{}: {outcome:?}", specimen.name);
+        assert!(outcome.is_ok(), "{}: {outcome:?}", specimen.name);
     }
     for specimen in files::exif_specimens().iter().chain(&files::xmp_specimens()) {
         let found = metadata::read(&specimen.bytes).expect("an image");

@@ -14,14 +14,15 @@ pub struct Specimen {
     pub name: String,
     /// The file.
     pub bytes: Vec<u8>,
-    /// Where its structure lies (headers, tables, directories): half of all mutations fall here. May be empty.
-    pub hot: Vec<Range<usize>>,
+    /// Where its structure lies (headers, tables, directories), as first and past the last byte: half of all mutations
+    /// fall here. May be empty.
+    pub hot: Vec<(usize, usize)>,
 }
 
 impl Specimen {
     /// A file whose first `head` bytes are its structure.
     pub fn new(name: impl Into<String>, bytes: Vec<u8>, head: usize) -> Self {
-        let hot = vec![0..head.min(bytes.len())];
+        let hot = vec![(0, head.min(bytes.len()))];
         Self { name: name.into(), bytes, hot }
     }
 }
@@ -133,9 +134,9 @@ impl<'a> Mutator<'a> {
 
 fn place(rng: &mut Pcg64Mcg, specimen: &Specimen, len: usize) -> usize {
     if !specimen.hot.is_empty() && rng.random() {
-        let range = &specimen.hot[rng.random_range(0..specimen.hot.len())];
-        if range.start < range.end.min(len) {
-            return rng.random_range(range.start..range.end.min(len));
+        let (start, end) = specimen.hot[rng.random_range(0..specimen.hot.len())];
+        if start < end.min(len) {
+            return rng.random_range(start..end.min(len));
         }
     }
     rng.random_range(0..len)

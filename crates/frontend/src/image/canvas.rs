@@ -170,7 +170,7 @@ impl<S: Sample> Canvas<S> {
                 }
             }
         }
-        let (top, is_last) = (self.num_rows % 2 == 0, self.num_rows + 1 == self.height);
+        let (top, is_last) = (self.num_rows.is_multiple_of(2), self.num_rows + 1 == self.height);
         if top && !is_last {
             return;
         }

@@ -3,5 +3,5 @@
 mod specimens;
 mod tiff;
 
-pub use specimens::{exif_specimens, image_specimens, mend_png, words, xmp_specimens};
+pub use specimens::{exif_specimens, image_specimens, interlaced_png, mend_png, words, xmp_specimens};
 pub use tiff::{Compression, TiffWriter};

@@ -4,6 +4,7 @@ use exif::experimental::Writer;
 use exif::{Field, In, Rational, Tag, Value};
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 
+use super::tiff::pack;
 use super::{Compression, TiffWriter};
 use crate::mutate::Specimen;
 
@@ -101,8 +102,8 @@ fn jpegs() -> Vec<Specimen> {
             e.set_sampling_factor(SamplingFactor::F_2_2);
         }),
         jpeg("progressive grey", ColorType::Luma, |e| e.set_progressive(true)),
-        jpeg("inks", ColorType::Cmyk, |_| {}),
-        jpeg("inks as YCCK", ColorType::CmykAsYcck, |_| {}),
+        jpeg("inks", ColorType::Cmyk, |e| e.set_sampling_factor(SamplingFactor::F_1_1)),
+        jpeg("inks as YCCK", ColorType::CmykAsYcck, |e| e.set_sampling_factor(SamplingFactor::F_1_1)),
     ]
 }
 
@@ -135,15 +136,32 @@ fn pngs() -> Vec<Specimen> {
         }
         all.push(Specimen::new(format!("png {name}"), bytes, 60));
     }
-    let interlaced = all.iter().find(|specimen| specimen.name == "png grey").map(|specimen| {
-        // The passes of Adam7 hold more rows than the image: what follows the data is read as them or missed.
-        let mut bytes = specimen.bytes.clone();
-        bytes[28] = 1;
-        mend_png(&mut bytes);
-        Specimen::new("png interlaced", bytes, 60)
-    });
-    all.extend(interlaced);
+    all.push(Specimen::new("png interlaced", interlaced_png(WIDTH, HEIGHT, &picture(1)), 60));
     all
+}
+
+/// A grey PNG of eight bits in the seven passes of Adam7, which the library does not write (PNG 1.2, section 8.2).
+pub fn interlaced_png(width: usize, height: usize, grays: &[u8]) -> Vec<u8> {
+    const PASSES: [(usize, usize, usize, usize); 7] =
+        [(0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)];
+    let mut raw = Vec::new();
+    for (left, top, across, down) in PASSES {
+        for y in (top..height).step_by(down).filter(|_| left < width) {
+            raw.push(0);
+            raw.extend((left..width).step_by(across).map(|x| grays[y * width + x]));
+        }
+    }
+    let mut bytes = b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR".to_vec();
+    bytes.extend((width as u32).to_be_bytes());
+    bytes.extend((height as u32).to_be_bytes());
+    bytes.extend([8, 0, 0, 0, 1, 0, 0, 0, 0]);
+    let packed = pack(Compression::Deflate, &raw);
+    bytes.extend((packed.len() as u32).to_be_bytes());
+    bytes.extend(b"IDAT");
+    bytes.extend(packed);
+    bytes.extend(b"\0\0\0\0\0\0\0\0IEND\0\0\0\0");
+    mend_png(&mut bytes);
+    bytes
 }
 
 /// Makes the checksums of a PNG's chunks right again, so that mutations get past them.
@@ -190,7 +208,7 @@ fn tiffs() -> Vec<Specimen> {
             let len = bytes.len();
             // The directory stands behind the pixels.
             let tail = len.saturating_sub(260);
-            Specimen { name: format!("tiff {name}"), bytes, hot: vec![0..16, tail..len] }
+            Specimen { name: format!("tiff {name}"), bytes, hot: vec![(0, 16), (tail, len)] }
         })
         .collect()
 }
@@ -206,7 +224,7 @@ pub fn exif_specimens() -> Vec<Specimen> {
         let mut specimen = jpeg(&format!("exif {name}"), ColorType::Luma, |encoder| {
             let _ = encoder.add_app_segment(1, segment);
         });
-        specimen.hot = vec![20..20 + block.len() + 10];
+        specimen.hot = vec![(20, 20 + block.len() + 10)];
         all.push(specimen);
         all.push(png_with_exif(&block, name));
     }
@@ -224,7 +242,7 @@ pub fn exif_specimens() -> Vec<Specimen> {
         all.push(Specimen {
             name: format!("tiff with exif, big {big}"),
             bytes,
-            hot: vec![len.saturating_sub(300)..len],
+            hot: vec![(len.saturating_sub(300), len)],
         });
     }
     all
@@ -240,7 +258,7 @@ fn png_with_exif(block: &[u8], name: &str) -> Specimen {
     bytes.extend([0; 4]);
     bytes.extend(plain.get(33..).unwrap_or_default());
     mend_png(&mut bytes);
-    Specimen { name: format!("png exif {name}"), bytes, hot: vec![33..41 + block.len()] }
+    Specimen { name: format!("png exif {name}"), bytes, hot: vec![(33, 41 + block.len())] }
 }
 
 fn exif_block(little_endian: bool) -> Vec<u8> {
@@ -325,7 +343,7 @@ pub fn xmp_specimens() -> Vec<Specimen> {
                 let _ = encoder.add_app_segment(1, segment);
                 let _ = encoder.add_app_segment(1, exif.clone());
             });
-            specimen.hot = vec![20..20 + len + 10];
+            specimen.hot = vec![(20, 20 + len + 10)];
             specimen
         })
         .collect()

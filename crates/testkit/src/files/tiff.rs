@@ -151,7 +151,7 @@ impl TiffWriter {
             }
             let whole = out.clone();
             (stride..out.len()).for_each(|k| out[k] = whole[k].wrapping_sub(whole[k - stride]));
-        } else if self.bits % 8 == 0 {
+        } else if self.bits.is_multiple_of(8) {
             (0..values.len()).for_each(|k| self.push(&mut out, difference(k), self.bits / 8));
         } else {
             let (mut held, mut count) = (0_u64, 0);
@@ -234,7 +234,7 @@ impl TiffWriter {
     }
 }
 
-fn pack(compression: Compression, raw: &[u8]) -> Vec<u8> {
+pub(super) fn pack(compression: Compression, raw: &[u8]) -> Vec<u8> {
     match compression {
         Compression::None => raw.to_vec(),
         Compression::PackBits => pack_bits(raw),

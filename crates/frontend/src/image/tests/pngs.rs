@@ -55,26 +55,7 @@ fn few_bits_are_spread_over_the_range() {
 
 #[test]
 fn interlaced_images_are_decoded() {
-    // The image library writes no Adam7: the passes of a grey image, each row with filter 0, packed by hand.
-    const PASSES: [(usize, usize, usize, usize); 7] =
-        [(0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)];
-    let mut raw = Vec::new();
-    for (x0, y0, dx, dy) in PASSES {
-        for y in (y0..SIZE.1).step_by(dy) {
-            raw.push(0);
-            raw.extend((x0..SIZE.0).step_by(dx).map(|x| grays()[y * SIZE.0 + x]));
-        }
-    }
-    let mut encoder = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::default());
-    std::io::Write::write_all(&mut encoder, &raw).unwrap();
-    let packed = encoder.finish().unwrap();
-    let mut bytes = png(&grays(), ColorType::Grayscale, BitDepth::Eight, None)[..33].to_vec();
-    bytes[28] = 1;
-    bytes.extend((packed.len() as u32).to_be_bytes());
-    bytes.extend(b"IDAT");
-    bytes.extend(packed);
-    bytes.extend(b"\0\0\0\0\0\0\0\0IEND\0\0\0\0");
-    terrane_testkit::files::mend_png(&mut bytes);
+    let bytes = terrane_testkit::files::interlaced_png(SIZE.0, SIZE.1, &grays());
     assert_eq!(open(&bytes).luma.data, grays());
 }
 
