@@ -61,7 +61,8 @@ pub struct Features {
     pub keypoints: Vec<Keypoint>,
     /// What the descriptors are.
     pub kind: DescriptorKind,
-    /// [`DescriptorKind::num_bytes`] bytes a keypoint, row after row.
+    /// [`DescriptorKind::num_bytes`] bytes a keypoint, row after row; none at all when features are imported with their
+    /// matches.
     pub descriptors: Vec<u8>,
     /// Colour (red, green, blue) at each keypoint, so that points have one without looking at pixels again.
     pub colors: Vec<[u8; 3]>,

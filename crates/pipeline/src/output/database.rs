@@ -8,7 +8,9 @@ use terrane_geometry::two_view::{essential_from_pose, estimate_homography};
 use terrane_geometry::{Camera, RansacOptions, Seed, fundamental::fundamental_from_eight};
 use terrane_scene::codec::Kind;
 use terrane_scene::colmap::database::{DatabaseGeometry, DatabaseWriter, SIFT_DESCRIPTORS, config_of};
-use terrane_scene::{FocalSource, ImageId, ImageTable, Keypoint, MatchedPair, PairKind, SceneError};
+use terrane_scene::{
+    CameraRecord, FocalSource, ImageId, ImageTable, Keypoint, MatchedPair, PairKind, SceneError,
+};
 
 use crate::execute::read;
 use crate::task::FinishedRun;
@@ -142,7 +144,7 @@ fn write(
             let images = [pair.summary.pair.first(), pair.summary.pair.second()];
             let [first, second] = images.map(number);
             let keypoints = images.map(|image| keypoints.get(&image).map_or(&[][..], Vec::as_slice));
-            let cameras = images.map(|image| table.camera_of(image).camera);
+            let cameras = images.map(|image| table.camera_of(image));
             writer.matches(first, second, &pair.matches).map_err(&failed)?;
             writer.geometry(first, second, &geometry(pair, &cameras, keypoints)).map_err(&failed)?;
             figures.pairs += 1;
@@ -167,36 +169,36 @@ const HOMOGRAPHY: RansacOptions = RansacOptions {
 /// Greatest transfer error of such an inlier in pixels, as in verification.
 const HOMOGRAPHY_ERROR_PX: f64 = 4.0;
 
-/// A verified pair with the matrices that it stands for: epipolar ones from the pose where intrinsics are trusted, from
-/// the matches where they are not; a homography where the matches lie on one.
+/// A verified pair with the matrices that it stands for.
+///
+/// A pose, and the epipolar matrices that follow from it, only where intrinsics are trusted and the matches agree with them:
+/// COLMAP's global mapper takes a pose that is there for good, and one that rests on a guess bends the result.
+/// Elsewhere the fundamental matrix of the matches; a homography where they lie on one.
 fn geometry<'a>(
     pair: &'a MatchedPair,
-    cameras: &[Camera; 2],
+    cameras: &[&CameraRecord; 2],
     keypoints: [&[Keypoint]; 2],
 ) -> DatabaseGeometry<'a> {
-    let summary = &pair.summary;
-    let [first, second] = cameras.map(|camera| intrinsic_matrix(&camera));
+    let kind = pair.summary.kind;
+    let is_trusted = cameras.iter().all(|record| record.focal_source != FocalSource::Guess);
+    let pose = pair.summary.second_from_first.filter(|_| is_trusted && kind != PairKind::Uncalibrated);
+    let [first, second] = cameras.map(|record| intrinsic_matrix(&record.camera));
     let inverses = (first.try_inverse(), second.try_inverse());
-    let essential = match summary.kind {
-        PairKind::Calibrated | PairKind::Planar => {
-            summary.second_from_first.as_ref().map(|pose| essential_from_pose(pose).normalize())
-        }
-        PairKind::Uncalibrated | PairKind::Panoramic | PairKind::Watermark => None,
-    };
+    let essential = pose
+        .as_ref()
+        .filter(|_| matches!(kind, PairKind::Calibrated | PairKind::Planar))
+        .map(|pose| essential_from_pose(pose).normalize());
     let points = |side: usize| -> Vec<Vector2<f64>> {
         let place = |index: &[u32; 2]| keypoints[side].get(index[side] as usize);
         let as_point = |k: &Keypoint| Vector2::new(f64::from(k.x_px), f64::from(k.y_px));
         pair.matches.iter().filter_map(place).map(as_point).collect()
     };
-    let by_pose = match (essential, inverses) {
+    let fundamental = match (essential, inverses) {
         (Some(essential), (Some(first), Some(second))) => Some(second.transpose() * essential * first),
+        _ if kind.has_baseline() => fundamental_from_eight(&points(0), &points(1)),
         _ => None,
     };
-    let fundamental = match summary.kind {
-        PairKind::Uncalibrated => fundamental_from_eight(&points(0), &points(1)),
-        _ => by_pose,
-    };
-    let homography = match (summary.kind, &summary.second_from_first, inverses.0) {
+    let homography = match (kind, &pose, inverses.0) {
         (PairKind::Planar, ..) => {
             let seed = Seed(0).derive("homography");
             estimate_homography(&points(0), &points(1), HOMOGRAPHY_ERROR_PX, &HOMOGRAPHY, seed)
@@ -206,12 +208,12 @@ fn geometry<'a>(
         _ => None,
     };
     DatabaseGeometry {
-        config: config_of(summary.kind),
+        config: config_of(kind),
         matches: &pair.matches,
         fundamental,
         essential,
         homography,
-        second_from_first: summary.second_from_first,
+        second_from_first: pose,
     }
 }
 

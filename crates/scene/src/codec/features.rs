@@ -1,5 +1,6 @@
 //! Features of a batch of images. Keypoints, colours and descriptors of each image are sections of their own, so that
-//! matching reads descriptors of a few images and mapping reads no descriptors at all.
+//! matching reads descriptors of a few images and mapping reads no descriptors at all. Features that were imported with their
+//! matches have no descriptors.
 //!
 //! `INFO` is a record: what the descriptors of the batch are, and what became of each image. All images of a batch have
 //! descriptors of one kind.
@@ -57,8 +58,9 @@ impl FeatureBatchWriter {
             }
             Ok(features) => {
                 let count = features.len();
-                let descriptors_len = count * features.kind.num_bytes();
-                if features.colors.len() != count || features.descriptors.len() != descriptors_len {
+                let num_bytes = features.descriptors.len();
+                let fits = num_bytes == count * features.kind.num_bytes() || num_bytes == 0;
+                if features.colors.len() != count || !fits {
                     return Err(SceneError::invalid(format!(
                         "features of image {item} have columns of unequal length"
                     )));
@@ -137,7 +139,8 @@ impl<S: Source> FeatureBatchReader<S> {
         }
         let (keypoints, colors) = self.keypoints_and_colors(place)?;
         let descriptors = self.archive.column(DESCRIPTORS, place as u32)?;
-        if descriptors.len() != keypoints.len() * kind.num_bytes() {
+        let fits = descriptors.len() == keypoints.len() * kind.num_bytes() || descriptors.is_empty();
+        if !fits {
             return Err(SceneError::corrupt(format!(
                 "image {place} of the batch has columns of unequal length"
             )));

@@ -115,6 +115,12 @@ fn features_are_read_image_by_image() {
     assert_eq!(read_batch(&bytes).unwrap(), [features(9), Features::default(), Features::default()]);
     assert_eq!(reader.keypoints_and_colors(0).unwrap().1.len(), 9);
     assert!(reader.features(3).unwrap_err().is_corrupt());
+    let bare = Features { descriptors: Vec::new(), ..features(3) };
+    let mut writer = FeatureBatchWriter::default();
+    writer.push(&Ok(bare.clone())).unwrap();
+    let bytes = writer.finish().unwrap();
+    let reader = FeatureBatchReader::open(bytes.as_slice()).unwrap();
+    assert_eq!(reader.features(0).unwrap(), bare);
     let unequal = Features { colors: Vec::new(), ..features(2) };
     assert!(FeatureBatchWriter::default().push(&Ok(unequal)).is_err());
 }
