@@ -76,6 +76,11 @@ pub(super) fn table(
         let list: BTreeSet<&str> = list.iter().map(|path| path.trim()).collect();
         images.retain(|image| list.contains(image.name.as_str()));
     }
+    // A listed photograph that is not there is as good as one that is not listed.
+    let known: BTreeSet<&str> = images.iter().map(|image| image.name.as_str()).collect();
+    rejected.retain(|file| {
+        !known.contains(file.path.as_str()) || context.config.photos.join(&file.path).exists()
+    });
     let mut by_path: BTreeMap<String, Usable> =
         photographs.into_iter().map(|photograph| (photograph.path.clone(), photograph)).collect();
     let unreadable: BTreeMap<String, String> =
