@@ -54,7 +54,7 @@ fn places_found_on_several_levels_are_described_once() {
         let options = CornerOptions { separation_px, max_orientations: 1, ..CornerOptions::default() };
         extract(&luma, None, (CornerDetector::Harris, CornerDescriptor::Brief), &options).keypoints
     };
-    let (all, apart) = (found(0.0), found(2.0));
+    let (all, apart) = (found(0.0), found(4.0));
     assert!(all.len() > 2 * apart.len(), "{} and {}", all.len(), apart.len());
     let crowded = |keypoints: &[Keypoint]| {
         let near = |a: &Keypoint, b: &Keypoint| (a.x_px - b.x_px).hypot(a.y_px - b.y_px) < 1.0;
