@@ -83,7 +83,9 @@ fn read_all(folder: &str) -> Photographs {
 fn main() {
     let settings = settings();
     let photographs = read_all(&settings.folder);
-    println!("method: features an image, CPU-s an image; matches a pair, CPU-s a pair; verified pairs, inliers in all");
+    println!(
+        "method: features an image, CPU-s an image; matches a pair, CPU-s a pair; verified pairs, inliers in all"
+    );
     for method in &settings.methods {
         let options = FeatureOptions { method: *method, ..settings.options.clone() };
         let start = cpu_time();

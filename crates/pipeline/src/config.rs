@@ -259,7 +259,10 @@ mod tests {
         assert!(config.validate().is_empty());
         config.features.method = FeatureMethod::Surf;
         let problems = config.validate();
-        assert!(problems.len() == 1 && problems[0].contains("features.surf: hessian_threshold"), "{problems:?}");
+        assert!(
+            problems.len() == 1 && problems[0].contains("features.surf: hessian_threshold"),
+            "{problems:?}"
+        );
         let named: RunConfig = serde_json::from_str(r#"{"features": {"method": "surf-upright"}}"#).unwrap();
         assert_eq!(named.features.method, FeatureMethod::SurfUpright);
     }

@@ -125,8 +125,7 @@ mod tests {
             (state >> 56) as u8
         };
         let bits: Vec<u8> = (0..200 * BINARY_DESCRIPTOR_LEN).map(|_| byte()).collect();
-        let features =
-            Features { kind: DescriptorKind::Bits256, descriptors: bits, ..Features::default() };
+        let features = Features { kind: DescriptorKind::Bits256, descriptors: bits, ..Features::default() };
         let vectors = features.vectors();
         assert_eq!((features.bits().len(), vectors.len()), (200, 200));
         let (mut hamming, mut euclidean) = (0.0, 0.0);

@@ -67,7 +67,8 @@ fn draw_pattern() -> Pattern {
 }
 
 /// Half the widths of the rows of the patch's disc, from the middle row on.
-const HALF_WIDTHS: [usize; RADIUS as usize + 1] = [15, 15, 15, 15, 14, 14, 14, 13, 13, 12, 11, 10, 9, 8, 6, 3];
+const HALF_WIDTHS: [usize; RADIUS as usize + 1] =
+    [15, 15, 15, 15, 14, 14, 14, 13, 13, 12, 11, 10, 9, 8, 6, 3];
 
 /// The direction from a corner to the centroid of brightness around it (Rosin 1999), of length one; along x where the
 /// patch is symmetric. The corner lies at least [`MARGIN`] inside.

@@ -120,10 +120,12 @@ fn multiply_body(rows: [&[u8]; 3], out: [&mut [f32]; 3]) {
     let [xx, xy, yy] = out.map(|out| &mut out[1..=inner]);
     for x in 0..inner {
         let value = |row: &[u8], x: usize| i32::from(row[x]);
-        let dx = value(above, x + 2) - value(above, x) + 2 * (value(row, x + 2) - value(row, x))
+        let dx = value(above, x + 2) - value(above, x)
+            + 2 * (value(row, x + 2) - value(row, x))
             + value(below, x + 2)
             - value(below, x);
-        let dy = value(below, x) - value(above, x) + 2 * (value(below, x + 1) - value(above, x + 1))
+        let dy = value(below, x) - value(above, x)
+            + 2 * (value(below, x + 1) - value(above, x + 1))
             + value(below, x + 2)
             - value(above, x + 2);
         xx[x] = (dx * dx) as f32;
@@ -265,9 +267,8 @@ mod tests {
         for corner in plain {
             assert_eq!(corner.response, measure_at(&image, corner.x, corner.y));
         }
-        let mut some: Vec<Candidate> = [(9, 8), (30, 8), (12, 21), (60, 36)]
-            .map(|(x, y)| Candidate { x, y, response: 0.0 })
-            .to_vec();
+        let mut some: Vec<Candidate> =
+            [(9, 8), (30, 8), (12, 21), (60, 36)].map(|(x, y)| Candidate { x, y, response: 0.0 }).to_vec();
         rate(Path::detect(), &image, &mut some);
         for rated in some {
             assert_eq!(rated.response, measure_at(&image, rated.x, rated.y));

@@ -217,9 +217,8 @@ fn describe_gradients(
             true => vec![0.0],
             false => blurred.orientations(place, BLUR_SIGMA_PX, options.max_orientations as usize),
         };
-        let describe = |orientation_rad| {
-            (orientation_rad, blurred.describe(place, BLUR_SIGMA_PX, orientation_rad))
-        };
+        let describe =
+            |orientation_rad| (orientation_rad, blurred.describe(place, BLUR_SIGMA_PX, orientation_rad));
         orientations.into_iter().map(describe).collect::<Vec<_>>()
     });
     let all: Vec<(Keypoint, _)> = corners

@@ -68,7 +68,11 @@ mod tests {
             (state >> 40) as f32 / (1 << 24) as f32
         };
         let places: Vec<Place> = (0..2000)
-            .map(|k| Place { x_px: 300.0 * uniform(), y_px: 200.0 * uniform(), step_px: [1.0, 1.5, 3.0][k % 3] })
+            .map(|k| Place {
+                x_px: 300.0 * uniform(),
+                y_px: 200.0 * uniform(),
+                step_px: [1.0, 1.5, 3.0][k % 3],
+            })
             .collect();
         let kept = separate(&places, 2.0, (300, 200));
         assert!(kept.is_sorted() && kept.len() > 300 && kept.len() < 1900, "{}", kept.len());

@@ -36,8 +36,7 @@ fn crossings_are_placed_to_hundredths_of_a_pixel() {
         };
         let luma = GrayImage { width: side, height: side, data: (0..side * side).map(value).collect() };
         let options = CornerOptions { num_levels: 1, ..CornerOptions::default() };
-        let found =
-            extract(&luma, None, (CornerDetector::Harris, CornerDescriptor::Gradients), &options);
+        let found = extract(&luma, None, (CornerDetector::Harris, CornerDescriptor::Gradients), &options);
         for (i, j) in [(2, 2), (3, 4), (4, 1)] {
             let (x, y) = (x0 + f64::from(i) * cell, y0 + f64::from(j) * cell);
             let error = |k: &Keypoint| (f64::from(k.x_px) - x).hypot(f64::from(k.y_px) - y);

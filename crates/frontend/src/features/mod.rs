@@ -49,15 +49,8 @@ pub enum FeatureMethod {
 
 impl FeatureMethod {
     /// Every method.
-    pub const ALL: [Self; 7] = [
-        Self::Sift,
-        Self::SiftUpright,
-        Self::Harris,
-        Self::Fast,
-        Self::Orb,
-        Self::Surf,
-        Self::SurfUpright,
-    ];
+    pub const ALL: [Self; 7] =
+        [Self::Sift, Self::SiftUpright, Self::Harris, Self::Fast, Self::Orb, Self::Surf, Self::SurfUpright];
 
     /// The name in options and flags.
     pub fn name(self) -> &'static str {
@@ -144,9 +137,8 @@ impl FeatureOptions {
 /// Colours are looked up in `rgb`, or are the grey of `luma` when there is none. A photograph that is too small or
 /// without texture has no features; that is no error.
 pub fn extract(luma: &GrayImage, rgb: Option<&RgbImage>, options: &FeatureOptions) -> Features {
-    let corners = |detector, descriptor| {
-        corners::extract(luma, rgb, (detector, descriptor), &options.corners)
-    };
+    let corners =
+        |detector, descriptor| corners::extract(luma, rgb, (detector, descriptor), &options.corners);
     match options.method {
         FeatureMethod::Sift => sift::extract(luma, rgb, &options.sift),
         FeatureMethod::SiftUpright => {

@@ -78,7 +78,8 @@ impl Scene {
     fn grey_at(&self, (x, y): (f64, f64)) -> f64 {
         let covers = |r: &&Rectangle| {
             let (dx, dy) = (x - r.x, y - r.y);
-            (r.cosine * dx + r.sine * dy).abs() < r.half_width && (r.cosine * dy - r.sine * dx).abs() < r.half_height
+            (r.cosine * dx + r.sine * dy).abs() < r.half_width
+                && (r.cosine * dy - r.sine * dx).abs() < r.half_height
         };
         self.rectangles.iter().rev().find(covers).map_or(120.0, |rectangle| rectangle.grey)
     }

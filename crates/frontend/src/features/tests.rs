@@ -190,7 +190,10 @@ fn upright_features_take_the_photograph_s_axes() {
     let luma = scene.draw(160, &Similarity::about_middle(160.0, 0.0, 1.0), 0.5);
     for method in [FeatureMethod::SiftUpright, FeatureMethod::SurfUpright] {
         let features = extract(&luma, None, &options(method));
-        assert!(features.len() > 30 && features.keypoints.iter().all(|k| k.orientation_rad == 0.0), "{method}");
+        assert!(
+            features.len() > 30 && features.keypoints.iter().all(|k| k.orientation_rad == 0.0),
+            "{method}"
+        );
     }
 }
 

@@ -106,9 +106,7 @@ pub fn match_features(first: &Features, second: &Features, options: &MatchOption
         (DescriptorKind::Bytes128, DescriptorKind::Bytes128) => {
             match_features_with(MatchKernel::fastest(), first, second, options)
         }
-        (DescriptorKind::Bits256, DescriptorKind::Bits256) => {
-            hamming::match_features(first, second, options)
-        }
+        (DescriptorKind::Bits256, DescriptorKind::Bits256) => hamming::match_features(first, second, options),
         _ => Vec::new(),
     }
 }

@@ -36,10 +36,13 @@ fn a_quarter_turn_turns_orientations_and_keeps_descriptors() {
     let (mut pairs, mut near, mut alike) = (0, 0, 0);
     for (k, a) in features.keypoints.iter().enumerate() {
         let (x, y) = (200.0 - a.y_px, a.x_px);
-        let same = |b: &&Keypoint| (b.x_px - x).hypot(b.y_px - y) < 0.3 && (b.scale_px / a.scale_px - 1.0).abs() < 0.05;
+        let same = |b: &&Keypoint| {
+            (b.x_px - x).hypot(b.y_px - y) < 0.3 && (b.scale_px / a.scale_px - 1.0).abs() < 0.05
+        };
         let Some(other) = turned.keypoints.iter().position(|b| same(&b)) else { continue };
         pairs += 1;
-        let turn = (turned.keypoints[other].orientation_rad - a.orientation_rad) / std::f32::consts::TAU - 0.25;
+        let turn =
+            (turned.keypoints[other].orientation_rad - a.orientation_rad) / std::f32::consts::TAU - 0.25;
         near += usize::from((turn - turn.round()).abs() < 0.02);
         let squared = |(a, b): (&u8, &u8)| u32::from(a.abs_diff(*b)).pow(2);
         let distance: u32 = features.descriptor(k).iter().zip(turned.descriptor(other)).map(squared).sum();

@@ -10,8 +10,8 @@ use terrane_geometry::{Camera, CameraModel, Rigid3, so3};
 
 use super::*;
 use crate::{
-    CameraId, ClusterId, DescriptorKind, Features, ImageFate, ImageId, ImagePair, Keypoint, MatchedPair, Observation,
-    PairKind, PairSummary, Reconstruction, RegisteredImage, SceneError, Submap, SubmapOutcome,
+    CameraId, ClusterId, DescriptorKind, Features, ImageFate, ImageId, ImagePair, Keypoint, MatchedPair,
+    Observation, PairKind, PairSummary, Reconstruction, RegisteredImage, SceneError, Submap, SubmapOutcome,
 };
 
 fn features(count: u32) -> Features {

@@ -32,7 +32,8 @@ fn has_instructions() -> bool {
 }
 
 fn is_right() -> bool {
-    let descriptor = |k: usize| -> Bits { std::array::from_fn(|byte| ((k * 67 + byte * 29 + k * byte) % 251) as u8) };
+    let descriptor =
+        |k: usize| -> Bits { std::array::from_fn(|byte| ((k * 67 + byte * 29 + k * byte) % 251) as u8) };
     let first: Vec<Bits> = (0..13).map(descriptor).collect();
     let second: Vec<Bits> = (5..28).map(descriptor).collect();
     nearest(&first, &second) == super::nearest_scalar(&first, &second)
@@ -104,7 +105,8 @@ impl Sweep {
             }
         }
         let first_column = block * WIDTH;
-        let second = |at: usize| self.state.columns.second.get(first_column + at).map_or(0, |&d| u64::from(d));
+        let second =
+            |at: usize| self.state.columns.second.get(first_column + at).map_or(0, |&d| u64::from(d));
         let column_limits = load(&std::array::from_fn(second));
         for r in 0..ROWS {
             let row_limit = self.state.rows.second.get(row + r).map_or(0, |&d| i64::from(d));

@@ -1,6 +1,6 @@
 //! The two least distances of each descriptor.
 
-use super::{Neighbour, Nearest};
+use super::{Nearest, Neighbour};
 
 /// Above every distance.
 const NOTHING: u16 = u16::MAX;
