@@ -54,17 +54,19 @@ fn check(method: FeatureMethod, cases: &[((f64, f64, f64), Bounds)]) {
     let same = Similarity::about_middle(SIDE as f64, 0.0, 1.0);
     let first = scene.draw(SIDE, &same, 0.5);
     let first = extract(&first, None, &options(method));
+    let mut wrong = Vec::new();
     for &((angle_rad, scale, blur_px), bounds) in cases {
         let second_from_first = Similarity::about_middle(SIDE as f64, angle_rad, scale);
         let second = extract(&scene.draw(SIDE, &second_from_first, blur_px), None, &options(method));
         let found = compare(&first, &second, &second_from_first);
         let holds = (0..3).all(|k| found[k] >= bounds[k]) && found[3] <= bounds[3];
-        let case = (angle_rad, scale, blur_px);
-        assert!(holds, "{method} {case:?}: {found:.3?} is not within {bounds:?}");
         // A bound that is far off guards nothing.
-        let is_tight = (0..3).all(|k| found[k] < bounds[k] + 0.25) && found[3] > 0.3 * bounds[3];
-        assert!(is_tight, "{method} {case:?}: {found:.3?} is far within {bounds:?}");
+        let is_tight = (0..3).all(|k| found[k] < bounds[k] + 0.2) && found[3] > 0.4 * bounds[3];
+        if !(holds && is_tight) {
+            wrong.push(format!("{:?}: {found:.3?}, bounds {bounds:?}", (angle_rad, scale, blur_px)));
+        }
     }
+    assert!(wrong.is_empty(), "{method}:\n{}", wrong.join("\n"));
 }
 
 #[test]
