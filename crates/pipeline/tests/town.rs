@@ -5,11 +5,12 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
+use terrane_frontend::pairs::PairMode;
 use terrane_geometry::alignment::umeyama;
 use terrane_pipeline::output::{self, RunCosts};
 use terrane_pipeline::{
-    ArtefactKey, Cancel, ExecutionContext, KnownArtefacts, PlanState, RunConfig, RunFigures, Stage, Store,
-    execute, plan,
+    ArtefactKey, Cancel, ExecutionContext, FeatureMethod, KnownArtefacts, PlanState, RunConfig, RunFigures,
+    Stage, Store, execute, plan,
 };
 use terrane_scene::colmap::{ModelFiles, read_binary};
 use terrane_testkit::town::{Town, TownOptions};
@@ -184,6 +185,24 @@ fn threads_order_and_broken_artefacts_do_not_change_a_byte() {
     let healed = tempfile::tempdir().unwrap();
     write(&config(1), &store, healed.path());
     assert_eq!(sparse(&plain), sparse(&healed));
+}
+
+#[test]
+fn every_kind_of_features_brings_the_town_out() {
+    let store = Store::memory();
+    for method in FeatureMethod::ALL {
+        let mut config = config(2);
+        config.features.method = method;
+        (config.features.corners.max_features, config.features.surf.max_features) = (1200, 1200);
+        if method == FeatureMethod::Orb {
+            // Binary descriptors, with pairs found by appearance.
+            config.pairs.select.mode = PairMode::Retrieval;
+            config.pairs.select.retrieval_neighbours = 8;
+        }
+        let (_, figures) = run(&config, &store, false);
+        assert_eq!(figures.registered, NUM_PHOTOGRAPHS as u64, "{method}: {figures:?}");
+        assert!((0.05..1.5).contains(&figures.mean_reprojection_error_px), "{method}: {figures:?}");
+    }
 }
 
 #[test]

@@ -236,7 +236,8 @@ mod tests {
         }
         let found = detect(Path::detect(), &image, 20);
         let near = |x: usize, y: usize| {
-            found.iter().any(|corner| corner.x.abs_diff(x) <= 1 && corner.y.abs_diff(y) <= 1)
+            // Pixels along an edge near a corner may differ from their circles as much as its own does.
+            found.iter().any(|corner| corner.x.abs_diff(x) <= 2 && corner.y.abs_diff(y) <= 2)
         };
         assert!(near(20, 24) && near(43, 24) && near(20, 39) && near(43, 39), "{found:?}");
         assert!(found.len() <= 8, "{found:?}");

@@ -43,6 +43,16 @@ pub(super) fn detect(path: Path, image: &GrayImage, threshold: f32) -> Vec<Candi
     found
 }
 
+/// Replaces the strength of candidates, which are in the order of rows, by the measure at their pixels.
+pub(super) fn rate(path: Path, image: &GrayImage, candidates: &mut [Candidate]) {
+    let mut stream = Stream::new(path, image);
+    let mut row = vec![0.0; image.width];
+    for of_row in candidates.chunk_by_mut(|a, b| a.y == b.y) {
+        stream.measure_row(of_row[0].y, &mut row);
+        of_row.iter_mut().for_each(|candidate| candidate.response = row[candidate.x]);
+    }
+}
+
 /// Appends the corners of row `y`, the middle one; of equal neighbours the first stays.
 fn keep_strongest(rows: &[Vec<f32>; 3], y: usize, threshold: f32, found: &mut Vec<Candidate>) {
     let [above, row, below] = rows;
@@ -75,9 +85,10 @@ impl<'a> Stream<'a> {
         Self { path, image, products, done: MARGIN - 1 - RADIUS, sums: rows() }
     }
 
-    /// The measure along row `y`; rows are asked for in order, from `MARGIN - 1` to as far from the other edge.
+    /// The measure along row `y`; rows are asked for in rising order, from `MARGIN - 1` to as far from the other edge.
     fn measure_row(&mut self, y: usize, out: &mut [f32]) {
         let row = |y: usize| &self.image.data[y * self.image.width..(y + 1) * self.image.width];
+        self.done = self.done.max(y - RADIUS);
         while self.done <= y + RADIUS {
             let [xx, xy, yy] = &mut self.products[self.done % WINDOW.len()];
             multiply(self.path, [row(self.done - 1), row(self.done), row(self.done + 1)], [xx, xy, yy]);
@@ -189,7 +200,8 @@ fn measures(image: &GrayImage, x: usize, y: usize) -> [[f32; 3]; 3] {
 }
 
 /// The measure at a pixel, which lies at least five inside.
-pub(super) fn measure_at(image: &GrayImage, x: usize, y: usize) -> f32 {
+#[cfg(test)]
+fn measure_at(image: &GrayImage, x: usize, y: usize) -> f32 {
     measures(image, x, y)[1][1]
 }
 
@@ -254,6 +266,12 @@ mod tests {
         assert_eq!(plain, detect(Path::detect(), &image, 1.0));
         for corner in plain {
             assert_eq!(corner.response, measure_at(&image, corner.x, corner.y));
+        }
+        let mut some: Vec<Candidate> =
+            [(9, 8), (30, 8), (12, 21), (60, 36)].map(|(x, y)| Candidate { x, y, response: 0.0 }).to_vec();
+        rate(Path::detect(), &image, &mut some);
+        for rated in some {
+            assert_eq!(rated.response, measure_at(&image, rated.x, rated.y));
         }
     }
 

@@ -159,20 +159,18 @@ fn detect(
     let of_level = |(level, Level { image, .. }): (usize, &Level<'_>)| -> Vec<Corner> {
         let candidates = match detector {
             CornerDetector::Harris => harris::detect(path, image, options.harris_threshold as f32),
-            CornerDetector::Fast => fast::detect(path, image, options.fast_threshold),
+            CornerDetector::Fast => {
+                // As in ORB: the segment test finds corners and does not order them well.
+                let mut candidates = fast::detect(path, image, options.fast_threshold);
+                harris::rate(path, image, &mut candidates);
+                candidates
+            }
         };
         let is_inside = |candidate: &Candidate| {
             (margin..image.width - margin).contains(&candidate.x)
                 && (margin..image.height - margin).contains(&candidate.y)
         };
-        let corner = |candidate: Candidate| {
-            let response = match detector {
-                CornerDetector::Harris => candidate.response,
-                // As in ORB: the segment test finds corners and does not order them well.
-                CornerDetector::Fast => harris::measure_at(image, candidate.x, candidate.y),
-            };
-            Corner { level, x: candidate.x as f32, y: candidate.y as f32, response }
-        };
+        let corner = |Candidate { x, y, response }| Corner { level, x: x as f32, y: y as f32, response };
         let corners = candidates.into_iter().filter(is_inside).map(corner);
         corners.filter(|corner| corner.response > 0.0).collect()
     };

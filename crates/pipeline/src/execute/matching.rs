@@ -108,8 +108,10 @@ impl<'a> Matcher<'a> {
     /// The pair at a place of the block.
     fn verified(&self, at: usize, pair: ImagePair) -> Result<MatchedPair, NotVerified> {
         let options = &self.context.config.matching.matching;
-        let side =
-            |image: ImageId| Photograph { camera: self.table.camera_of(image), features: &self.images[&image] };
+        let side = |image: ImageId| Photograph {
+            camera: self.table.camera_of(image),
+            features: &self.images[&image],
+        };
         let both = [&side(pair.first()), &side(pair.second())];
         let match_all = || match &self.imported {
             Some(imported) => imported[at].clone(),
