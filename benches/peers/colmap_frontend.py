@@ -6,7 +6,7 @@ usage: colmap_frontend.py IMAGES WORK [--first-octave N] [--max-features N] [--l
 
 WORK/database.db is left behind. Each stage runs in a child of its own, so that its CPU time and peak memory are the stage's. Prints one
 JSON object: `extract` and `match` with wall_s, cpu_s, peak_mib; `images` with the number of features of each; `pairs` with the names
-of both images, how many raw matches there were and how many agree with the two-view geometry.
+of both images, how many matches agree with their two-view geometry, and its kind.
 """
 import argparse, json, multiprocessing, resource, shutil, sys, time
 from pathlib import Path
@@ -82,15 +82,13 @@ def main():
         images = {image.image_id: image.name for image in found.read_all_images()}
         result["images"] = {name: found.num_keypoints_for_image(number) for number, name in images.items()}
         if not args.extract_only:
-            matched = {pair: len(matches) for pair, matches in zip(*found.read_all_matches())} if False else {}
-            result["pairs"] = pairs(found, images, matched)
+            result["pairs"] = pairs(pycolmap, found, images)
     print(json.dumps(result))
 
 
-def pairs(found, images, _):
+def pairs(pycolmap, found, images):
     """Every pair of the database with its counts."""
     rows = []
-    import pycolmap
     ids, geometries = found.read_two_view_geometries()
     for pair_id, geometry in zip(ids, geometries):
         first, second = pycolmap.pair_id_to_image_pair(pair_id)

@@ -7,6 +7,7 @@ mod extraction;
 mod interchange;
 mod kernels;
 mod memory;
+mod modes;
 mod peer;
 mod retrieval;
 mod sets;
@@ -27,6 +28,7 @@ const SECTIONS: &[Section] = &[
     ("whole", whole::rows),
     ("retrieval", retrieval::rows),
     ("interchange", interchange::rows),
+    ("modes", modes::rows),
 ];
 
 fn main() -> anyhow::Result<()> {
