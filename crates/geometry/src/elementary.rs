@@ -72,8 +72,8 @@ mod tests {
         assert!((natural_log(1e-320) - 1e-320_f64.ln()).abs() < 1e-10);
         assert_eq!((natural_log(1.0), natural_log(0.0)), (0.0, f64::NEG_INFINITY));
         assert!(natural_log(-1.0).is_nan() && natural_log(f64::NAN).is_nan());
-        for p in [0.0, 1e-300, 1e-12, 1e-6, 0.9e-5, 1.1e-5, 0.3, 0.999] {
-            let theirs = (-p as f64).ln_1p();
+        for p in [0.0_f64, 1e-300, 1e-12, 1e-6, 0.9e-5, 1.1e-5, 0.3, 0.999] {
+            let theirs = (-p).ln_1p();
             assert!((log_of_complement(p) - theirs).abs() <= 1e-10 * theirs.abs(), "{p}");
         }
     }

@@ -145,7 +145,8 @@ fn dot(a: &Wide, b: &Wide) -> i32 {
     {
         use std::arch::x86_64::{__m128i, _mm_add_epi32, _mm_madd_epi16};
         let add = |sum, (x, y): (&[i16; 8], &[i16; 8])| {
-            _mm_add_epi32(sum, _mm_madd_epi16(bytemuck::cast(*x), bytemuck::cast(*y)))
+            // SAFETY: every processor of this architecture has SSE2, which is all that these need.
+            unsafe { _mm_add_epi32(sum, _mm_madd_epi16(bytemuck::cast(*x), bytemuck::cast(*y))) }
         };
         let sums: __m128i = chunks.fold(bytemuck::Zeroable::zeroed(), add);
         bytemuck::cast::<__m128i, [i32; 4]>(sums).iter().sum()

@@ -86,21 +86,23 @@ fn forward_motion_and_wide_angles_are_scenes_with_depth() {
 }
 
 #[test]
-fn wrong_focal_lengths_are_survived_and_noticed() {
+fn wrong_focal_lengths_are_survived() {
+    let scene = |seed| Scene::observed(300, &side_step(), deep, seed).with_outliers(150, seed + 1);
     for factor in [0.5, 0.7, 1.0, 1.4, 2.0] {
-        for source in [FocalSource::Guess, FocalSource::Exif] {
-            let camera = record(1000.0 * factor, source);
-            // Trusted and right, it is calibrated; trusted and wrong by a little, either is fair.
-            let is_fair = source == FocalSource::Guess || factor == 0.5 || factor == 2.0;
-            let kind = if is_fair { PairKind::Uncalibrated } else { PairKind::Calibrated };
-            if !is_fair && factor != 1.0 {
-                continue;
-            }
-            let right = num_right(kind, &camera, |seed| {
-                Scene::observed(300, &side_step(), deep, seed).with_outliers(150, seed + 1)
-            });
-            assert!(right >= 7, "factor {factor}, {source:?}: {right} of {CASES}");
-        }
+        let guessed = record(1000.0 * factor, FocalSource::Guess);
+        let right = num_right(PairKind::Uncalibrated, &guessed, scene);
+        assert!(right >= 7, "factor {factor}, guessed: {right} of {CASES}");
+        // Trusted, the essential matrix is kept while it explains nearly as much, whatever the kind.
+        let trusted = record(1000.0 * factor, FocalSource::Exif);
+        let shares: Vec<usize> = (0..CASES)
+            .map(|seed| {
+                let scene = scene(100 + 10 * seed);
+                let found = scene.verify_with(&trusted, &VerificationOptions::default());
+                found.map_or(0, |found| scene.judge(&found).0 / 3)
+            })
+            .collect();
+        let num_good = shares.iter().filter(|share| **share >= 90).count();
+        assert!(num_good >= 7, "factor {factor}, trusted: {shares:?} % of the true matches");
     }
 }
 
