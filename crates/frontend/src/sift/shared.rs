@@ -5,26 +5,24 @@ use terrane_scene::{DESCRIPTOR_LEN, Keypoint};
 
 use super::gradient::Place;
 use super::isa::Isa;
-use super::octave::{FixedPlane, Size};
-use super::rows::BLOCK;
+use super::octave::{Plane, Size};
 use super::select::{Ranked, select};
 use super::{descriptor, math};
 use crate::image::{GrayImage, RgbImage};
 
 /// A blurred image in 16-bit fixed point with 8 fractional bits.
-pub(crate) struct BlurredImage(FixedPlane);
+pub(crate) struct BlurredImage(Plane);
 
 impl BlurredImage {
     /// An image of zeros.
     pub(crate) fn new(width: usize, height: usize) -> Self {
-        let stride = width.next_multiple_of(BLOCK);
-        let data = vec![0; stride * height + FixedPlane::SLACK];
-        Self(FixedPlane { size: Size { width, height }, stride, data })
+        let data = vec![0; width * height + Plane::SLACK];
+        Self(Plane { size: Size { width, height }, step: 1, data })
     }
 
     /// Values from one row to the next.
     pub(crate) fn stride(&self) -> usize {
-        self.0.stride
+        self.0.size.width
     }
 
     /// All values; those of a row start at a multiple of the stride.
@@ -32,9 +30,10 @@ impl BlurredImage {
         &self.0.data
     }
 
-    /// A row, padding included.
+    /// A row.
     pub(crate) fn row_mut(&mut self, y: usize) -> &mut [u16] {
-        &mut self.0.data[y * self.0.stride..(y + 1) * self.0.stride]
+        let width = self.stride();
+        &mut self.0.data[y * width..(y + 1) * width]
     }
 
     /// Directions in radians of the dominant gradients around a place, strongest first, at most `limit`. The first
