@@ -14,6 +14,10 @@ use crate::matching::guided::{Guide, GuidedSide, match_guided};
 use crate::matching::{Match, MatchOptions, match_features};
 
 /// When matches are looked for along epipolar lines.
+///
+/// Measured with 8,192 features an image on Strecha's fountain (AVX2): guided first, a pair takes half the time of comparing all
+/// with all and has a quarter more matches. But along lines that are wrong, some sixty features match by chance, as on pairs of
+/// the castle's courtyard that see different walls: hence off by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum GuidedMatching {
