@@ -27,7 +27,7 @@ fn main() {
     let (mut read, mut refused) = (0_u64, 0_u64);
     for seed in first..first + executions {
         // Rows are damaged through SQLite, which is slow: one in sixteen.
-        if seed % 16 == 0 {
+        if seed.is_multiple_of(16) {
             std::fs::write(&target, &whole).expect("the damaged file is written");
             mutate::values(&target, seed);
         } else {

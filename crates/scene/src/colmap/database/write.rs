@@ -83,7 +83,7 @@ impl DatabaseWriter {
     /// # Errors
     /// As [`DatabaseWriter::image`]; invalid when the bytes are not that many equal rows.
     pub fn descriptors(&mut self, image: i64, kind: i64, rows: usize, data: &[u8]) -> Result<(), SceneError> {
-        if data.len() % rows.max(1) != 0 {
+        if !data.len().is_multiple_of(rows.max(1)) {
             return Err(SceneError::invalid(format!("descriptors of image {image} are of unequal length")));
         }
         let cols = data.len() / rows.max(1);
