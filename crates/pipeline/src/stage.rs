@@ -79,7 +79,10 @@ impl Stage {
     /// The version of what the stage computes. Raised whenever its bytes would differ for the same inputs and options,
     /// so that no artefact of an older program is taken for today's.
     pub fn version(self) -> u32 {
-        1
+        match self {
+            Stage::Features => 2,
+            _ => 1,
+        }
     }
 }
 
