@@ -81,9 +81,15 @@ impl Stage {
     pub fn version(self) -> u32 {
         match self {
             // Ingest: XMP, masks, imports, TIFF and narrow 16-bit images. Features: colours are means of 2 x 2 pixels, scale
-            // space in fixed point, kinds of descriptors. Pairs: footprints, ranks. Match: cascade, single-precision screening. Export: what was
-            // read beside photographs, and where every artefact of the run is.
-            Stage::Ingest | Stage::Features | Stage::Pairs | Stage::Match | Stage::Export => 2,
+            // space in fixed point, kinds of descriptors. Pairs: footprints, ranks. Match: cascade, single-precision
+            // screening. Submap: roots of cubics and undistortion in their last bits. Export: what was read beside
+            // photographs, and where every artefact of the run is.
+            Stage::Ingest
+            | Stage::Features
+            | Stage::Pairs
+            | Stage::Match
+            | Stage::Submap
+            | Stage::Export => 2,
             _ => 1,
         }
     }

@@ -59,6 +59,9 @@ struct Fit {
     edge_ratio: f64,
 }
 
+/// How far from its cell an extremum may lie, in pixels and levels (VLFeat). What another cell finds too is found once.
+const MAX_OFFSET: f64 = 1.5;
+
 /// How often a place may move to a neighbour before it is given up.
 const MAX_MOVES: usize = 5;
 
@@ -112,13 +115,13 @@ impl Detector {
             values = neighborhood_of(differences, cell);
             fit = self::fit(&values)?;
         }
-        let is_near = fit.offset.iter().all(|o| o.abs() < 1.0);
+        let is_near = fit.offset.iter().all(|o| o.abs() < MAX_OFFSET);
         let Thresholds { contrast_units, edge_bound } = self.thresholds;
         if !is_near || fit.value.abs() < contrast_units || !(0.0..edge_bound).contains(&fit.edge_ratio) {
             return None;
         }
         let [dx, dy, ds] = fit.offset;
-        let [dx, dy] = unbiased_place(&values, ds).unwrap_or([dx, dy]);
+        let [dx, dy] = unbiased_place(&values, ds.clamp(-1.0, 1.0)).unwrap_or([dx, dy]);
         let s = cell.s as f64 + ds;
         Some(Extremum {
             x: ((self.first_column + cell.x) as f64 + dx) as f32,
@@ -129,7 +132,7 @@ impl Detector {
         })
     }
 
-    /// The neighbour that the extremum of a fit lies in, as far as it can be reached from the start.
+    /// The neighbour in the same level that the extremum of a fit lies in, as far as it can be reached from the start.
     fn neighbor(&self, cell: Cell, offset: &[f64; 3], start: Cell) -> Cell {
         let moved = |at: usize, offset: f64, low: usize, high: usize| {
             let to = if offset > 0.6 {
@@ -148,7 +151,7 @@ impl Detector {
         Cell {
             x: moved(cell.x, offset[0], low_x, high_x),
             y: moved(cell.y, offset[1], low_y, high_y),
-            s: moved(cell.s, offset[2], 1, LEVELS),
+            s: cell.s,
         }
     }
 }

@@ -34,7 +34,7 @@ use gradient::Place;
 use isa::Isa;
 use octave::{Base, LEVELS, Octave, TILE_COLUMNS};
 pub use options::{FirstOctave, SiftOptions};
-use select::{Ranked, select};
+use select::{Placed, Ranked, first_at_places, select};
 
 /// The shortest side of an octave, in its pixels.
 const MIN_SIDE: usize = 12;
@@ -138,6 +138,11 @@ impl Blob {
         self.extremum.response * scale_px * scale_px
     }
 
+    fn placed(&self, options: &SiftOptions) -> Placed {
+        let Keypoint { x_px, y_px, scale_px, .. } = self.keypoint(options, 0.0);
+        Placed { x_px, y_px, scale_px, octave: self.octave, step_px: self.step(options) }
+    }
+
     fn ranked(&self, options: &SiftOptions) -> Ranked {
         let Keypoint { x_px, y_px, .. } = self.keypoint(options, 0.0);
         Ranked { x_px, y_px }
@@ -160,8 +165,10 @@ fn strongest(octaves: &[Octave], luma: &GrayImage, mask: Option<&Mask>, options:
             .then(m.x.total_cmp(&n.x))
             .then(m.sigma.total_cmp(&n.sigma))
     });
-    // Two cells may have led to one and the same extremum.
-    blobs.dedup_by(|a, b| a.octave == b.octave && a.extremum == b.extremum);
+    let places: Vec<Placed> = blobs.iter().map(|blob| blob.placed(options)).collect();
+    let is_first = first_at_places(&places);
+    let mut is_first = is_first.iter();
+    blobs.retain(|_| is_first.next() == Some(&true));
     if let Some(mask) = mask {
         blobs.retain(|blob| {
             let Ranked { x_px, y_px } = blob.ranked(options);

@@ -59,17 +59,17 @@ fn options(first_octave: FirstOctave) -> SiftOptions {
 #[test]
 fn blobs_are_found_where_they_are_in_every_octave() {
     let cases = [
+        // Brightness of 16 bits is rounded, which moves a blob by up to two thousandths of a pixel.
         // The finest blobs are as small as pixels: their samples are no blob any more.
         (FirstOctave::Doubled, 1.3, 0.015),
         (FirstOctave::Doubled, 1.6, 0.006),
-        (FirstOctave::Doubled, 2.3, 0.005),
-        (FirstOctave::Original, 2.3, 0.005),
-        (FirstOctave::Original, 3.1, 0.005),
-        // Sixteen bits round by a thousandth.
-        (FirstOctave::Original, 4.6, 0.006),
-        (FirstOctave::Original, 6.0, 0.005),
-        (FirstOctave::Original, 9.3, 0.005),
-        (FirstOctave::Doubled, 9.3, 0.005),
+        (FirstOctave::Doubled, 2.3, 0.007),
+        (FirstOctave::Original, 2.3, 0.007),
+        (FirstOctave::Original, 3.1, 0.007),
+        (FirstOctave::Original, 4.6, 0.007),
+        (FirstOctave::Original, 6.0, 0.007),
+        (FirstOctave::Original, 9.3, 0.007),
+        (FirstOctave::Doubled, 9.3, 0.007),
     ];
     for (first_octave, sigma, bound) in cases {
         for (x, y) in [(80.5, 77.0), (80.13, 76.84), (79.71, 77.36), (81.0, 78.25), (82.6, 79.9)] {
@@ -245,6 +245,36 @@ fn selection_spreads_and_keeps_the_strongest() {
     assert_eq!(spread.len(), 300);
     assert!(spread.iter().filter(|&&k| k >= 900).count() > 50);
     assert!(spread.is_sorted());
+}
+
+#[test]
+fn a_blob_is_one_place() {
+    let place = |x_px: f32, scale_px: f32, octave: usize| Placed {
+        x_px,
+        y_px: 40.0,
+        scale_px,
+        octave,
+        step_px: (1 << octave) as f32,
+    };
+    let places = [
+        place(40.0, 4.1, 1),
+        // The same blob from the octave before, and a neighbour in another cell.
+        place(41.9, 4.0, 0),
+        place(38.1, 4.3, 1),
+        // Farther, coarser and finer ones.
+        place(42.2, 4.0, 1),
+        place(40.0, 5.2, 1),
+        place(40.0, 3.2, 0),
+    ];
+    assert_eq!(first_at_places(&places), [true, false, false, true, true, true]);
+    let image = Scene::random(900, 260.0, 4).draw(260, 260, (1.0, 0.0), (0.0, 0.0));
+    let features = extract(&image, None, &SiftOptions { max_orientations: 1, ..SiftOptions::default() });
+    for (k, a) in features.keypoints.iter().enumerate() {
+        for b in &features.keypoints[..k] {
+            let is_near = (a.x_px - b.x_px).hypot(a.y_px - b.y_px) < 0.45 * a.scale_px;
+            assert!(!is_near || (a.scale_px / b.scale_px).ln().abs() > 0.2, "{a:?} {b:?}");
+        }
+    }
 }
 
 #[test]
