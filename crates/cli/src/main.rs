@@ -7,6 +7,7 @@ mod demo;
 mod exit;
 mod export;
 mod inspect;
+mod log;
 mod machine;
 mod models;
 mod progress;

@@ -18,7 +18,7 @@ use crate::args::RunFlags;
 use crate::exit::Failure;
 use crate::machine::Share;
 use crate::progress::Progress;
-use crate::{config, service, summary};
+use crate::{config, log, service, summary};
 
 /// Workers that are still busy at the end get this long to leave by themselves.
 const GRACE: Duration = Duration::from_secs(2);
@@ -102,7 +102,7 @@ pub async fn run(flags: RunFlags, json: bool) -> Result<(), Failure> {
 
 /// Runs the coordinator and the workers until the run is over.
 pub async fn reconstruct(plan: &Plan, json: bool) -> Result<RunPhase, Failure> {
-    log_to_file(&plan.hidden)?;
+    log::to_file(&plan.hidden)?;
     let listener = service::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, plan.port))).await?;
     let address = listener
         .local_addr()
@@ -187,25 +187,6 @@ async fn watched(handle: &Handle, run: RunId, progress: &mut Progress) -> Result
         }
         watch.changed().await.map_err(|_| Failure::system("the coordinator has ended"))?;
     }
-}
-
-/// Log lines of the libraries go to a file beside the workers' ones, so that they don't disturb the progress.
-fn log_to_file(hidden: &Path) -> Result<(), Failure> {
-    let folder = hidden.join("logs");
-    let path = folder.join("coordinator.log");
-    let failed = |error: std::io::Error| {
-        Failure::system(format!("the log {} can't be written: {error}", path.display()))
-    };
-    std::fs::create_dir_all(&folder).map_err(failed)?;
-    let file = File::options().create(true).append(true).open(&path).map_err(failed)?;
-    let filter = tracing_subscriber::EnvFilter::try_from_env("TERRANE_LOG");
-    let filter = filter.unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    let _ = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(Arc::new(file))
-        .with_ansi(false)
-        .try_init();
-    Ok(())
 }
 
 /// Tells how a run came out, and maps it to the exit code.

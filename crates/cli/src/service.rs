@@ -16,6 +16,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::args::{CoordinatorFlags, RemoteFlags, WorkerFlags};
 use crate::exit::Failure;
+use crate::log;
 use crate::machine::{self, Share};
 
 /// What drives calls and waits. Two threads: nothing computes here.
@@ -71,21 +72,9 @@ pub async fn asked_to_end() {
     }
 }
 
-/// Log lines of the libraries go to standard error; TERRANE_LOG says which, as in `debug` or `terrane_cluster=debug`.
-pub fn log_to_stderr() {
-    let filter = tracing_subscriber::EnvFilter::try_from_env("TERRANE_LOG");
-    let filter = filter.unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    // Fails only when a log is set up already, and then that one is as good.
-    let _ = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
-        .with_ansi(false)
-        .try_init();
-}
-
 /// Serves until it is asked to end.
 pub async fn coordinator(flags: CoordinatorFlags) -> Result<(), Failure> {
-    log_to_stderr();
+    log::to_stderr();
     let token = token()?;
     if !flags.listen.ip().is_loopback() && !flags.allow_plaintext {
         return Err(Failure::input(format!(
@@ -121,7 +110,7 @@ pub async fn coordinator(flags: CoordinatorFlags) -> Result<(), Failure> {
 
 /// Works until the coordinator says to leave, or it is asked to end.
 pub async fn worker(flags: WorkerFlags) -> Result<(), Failure> {
-    log_to_stderr();
+    log::to_stderr();
     if let Some(parent) = flags.parent {
         die_with_parent(parent)?;
     }
