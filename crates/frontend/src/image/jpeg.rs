@@ -105,13 +105,22 @@ fn unsupported(what: &str) -> FrontendError {
 }
 
 pub(super) fn probe(bytes: &[u8]) -> Result<(u32, u32), FrontendError> {
-    let frame = walk(bytes)?;
+    let frame = walk(bytes, Until::End)?;
     check_plausible(Format::Jpeg, bytes.len(), u64::from(frame.width) * u64::from(frame.height), MAX_RATIO)?;
     Ok((frame.width, frame.height))
 }
 
-/// Walks all segments of a file up to the end of its image.
-pub(super) fn walk(bytes: &[u8]) -> Result<Frame, FrontendError> {
+/// How far a walk goes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Until {
+    /// To the first scan: all headers.
+    Scan,
+    /// To the end of the image.
+    End,
+}
+
+/// Walks the segments of a file.
+pub(super) fn walk(bytes: &[u8], until: Until) -> Result<Frame, FrontendError> {
     let mut frame = None;
     let mut has_scan = false;
     let mut at = 2;
@@ -140,6 +149,9 @@ pub(super) fn walk(bytes: &[u8]) -> Result<Frame, FrontendError> {
         }
         if let (START_OF_SCAN, Some(frame)) = (marker, frame) {
             frame.check_scan(segment)?;
+            if until == Until::Scan {
+                return Ok(frame);
+            }
             has_scan = true;
         }
         at = payload + length;
@@ -179,7 +191,7 @@ pub(super) fn decode(
     options: &DecodeOptions,
 ) -> Result<DecodedImage, FrontendError> {
     let (width, height) = (probe.width as usize, probe.height as usize);
-    let frame = walk(bytes)?;
+    let frame = walk(bytes, Until::Scan)?;
     let sizes = DecoderOptions::default().set_max_width(width).set_max_height(height).set_strict_mode(false);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), sizes);
     decoder.decode_headers().map_err(broken)?;

@@ -137,7 +137,7 @@ fn unpack_jpeg(
         whole.extend_from_slice(tables.get(2..tables.len().saturating_sub(2)).unwrap_or_default());
     }
     whole.extend_from_slice(packed.strip_prefix(&[0xff, 0xd8]).unwrap_or(packed));
-    let frame = jpeg::walk(&whole)?;
+    let frame = jpeg::walk(&whole, jpeg::Until::End)?;
     let samples = layout.samples_per_chunk_pixel();
     if frame.width as usize != width
         || (frame.height as usize) > height
