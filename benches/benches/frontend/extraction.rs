@@ -37,9 +37,15 @@ fn compare(
     let flags = ["--extract-only", "--limit", &limit, "--first-octave", octave];
     let answer = peer::frontend(set, &flags);
     let count = photographs.len() as f64;
-    let theirs = answer.as_ref().and_then(|answer| peer::number(&answer.value, &["extract", "cpu_s"])).map(|s| s / count);
+    let theirs = answer
+        .as_ref()
+        .and_then(|answer| peer::number(&answer.value, &["extract", "cpu_s"]))
+        .map(|s| s / count);
     let features = answer.as_ref().and_then(|answer| {
-        Some(answer.value["images"].as_object()?.values().filter_map(serde_json::Value::as_f64).sum::<f64>() / count)
+        Some(
+            answer.value["images"].as_object()?.values().filter_map(serde_json::Value::as_f64).sum::<f64>()
+                / count,
+        )
     });
     let max_features = features.map_or(8192, |features| features.round() as u32);
     let options = SiftOptions { max_features, first_octave, ..SiftOptions::default() };

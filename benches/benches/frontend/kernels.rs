@@ -16,11 +16,16 @@ type Descriptor = [u8; DESCRIPTOR_LEN];
 
 pub fn rows(_: &Request) -> anyhow::Result<Vec<Row>> {
     let photographs = Set::named("fountain-P11").photographs(2)?;
-    let options =
-        SiftOptions { max_features: COUNT as u32, first_octave: FirstOctave::Doubled, ..SiftOptions::default() };
+    let options = SiftOptions {
+        max_features: COUNT as u32,
+        first_octave: FirstOctave::Doubled,
+        ..SiftOptions::default()
+    };
     let descriptors: Vec<Vec<Descriptor>> = decoded(&photographs)?
         .iter()
-        .map(|image| sift::extract(&image.luma, None, &options).descriptors.as_chunks::<DESCRIPTOR_LEN>().0.to_vec())
+        .map(|image| {
+            sift::extract(&image.luma, None, &options).descriptors.as_chunks::<DESCRIPTOR_LEN>().0.to_vec()
+        })
         .collect();
     let (first, second) = (&descriptors[0], &descriptors[1]);
     let macs = (first.len() * second.len() * DESCRIPTOR_LEN) as f64;
@@ -44,7 +49,12 @@ pub fn rows(_: &Request) -> anyhow::Result<Vec<Row>> {
         let figure = |what: &str| format!("{} x {} by {name}: {what}", first.len(), second.len());
         rows.push(Row::new(figure("time"), Some(best_s * 1e3), "ms", Bar::None));
         rows.push(Row::new(figure("speed"), Some(macs / best_s * 1e-9), "GMAC/s", Bar::None));
-        rows.push(Row::new(figure("equal to the first path"), Some(f64::from(u8::from(equal))), "", Bar::AtLeast(1.0)));
+        rows.push(Row::new(
+            figure("equal to the first path"),
+            Some(f64::from(u8::from(equal))),
+            "",
+            Bar::AtLeast(1.0),
+        ));
     }
     Ok(rows)
 }

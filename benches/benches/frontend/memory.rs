@@ -66,7 +66,8 @@ fn reset_peak() -> anyhow::Result<()> {
 
 /// A JPEG of 4,243 x 2,828 pixels that shows what a photograph does.
 fn twelve_megapixels(bytes: &[u8]) -> anyhow::Result<Vec<u8>> {
-    let rgb = image::decode(bytes, &DecodeOptions::default())?.rgb.ok_or_else(|| anyhow::anyhow!("no colours"))?;
+    let rgb =
+        image::decode(bytes, &DecodeOptions::default())?.rgb.ok_or_else(|| anyhow::anyhow!("no colours"))?;
     let (width, height) = (4243_usize, 2828_usize);
     let mut data = Vec::with_capacity(3 * width * height);
     for y in 0..height {

@@ -38,7 +38,11 @@ pub fn rows(_: &Request) -> anyhow::Result<Vec<Row>> {
         let report = std::fs::read(out.path().join("report.json")).ok();
         let report: Value = report.and_then(|bytes| serde_json::from_slice(&bytes).ok()).unwrap_or_default();
         let component = &report["components"][0];
-        let shown = if mode[0] == "--masks" { "--masks, a band of each photograph".to_owned() } else { mode.join(" ") };
+        let shown = if mode[0] == "--masks" {
+            "--masks, a band of each photograph".to_owned()
+        } else {
+            mode.join(" ")
+        };
         let figure = |what: &str| format!("brighton-half {shown}: {what}");
         let cpu = ended.as_ref().ok().map(|(usage, _)| usage.cpu_s);
         rows.push(Row::new(figure("registered of 18"), component["images"].as_f64(), "", Bar::AtLeast(18.0)));
@@ -51,9 +55,11 @@ pub fn rows(_: &Request) -> anyhow::Result<Vec<Row>> {
 /// A mask for each photograph that keeps features out of its lower fifth.
 fn write_masks(set: &Set, folder: &Path) -> anyhow::Result<()> {
     for photograph in set.photographs(usize::MAX)? {
-        let (width, height) = (photograph.camera.camera.width_px as usize, photograph.camera.camera.height_px as usize);
-        let data: Vec<u8> =
-            (0..height).flat_map(|y| std::iter::repeat_n(if 5 * y < 4 * height { 255 } else { 0 }, width)).collect();
+        let (width, height) =
+            (photograph.camera.camera.width_px as usize, photograph.camera.camera.height_px as usize);
+        let data: Vec<u8> = (0..height)
+            .flat_map(|y| std::iter::repeat_n(if 5 * y < 4 * height { 255 } else { 0 }, width))
+            .collect();
         let file = std::fs::File::create(folder.join(format!("{}.png", photograph.name)))?;
         let mut encoder = png::Encoder::new(std::io::BufWriter::new(file), width as u32, height as u32);
         encoder.set_color(png::ColorType::Grayscale);

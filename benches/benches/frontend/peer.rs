@@ -66,7 +66,11 @@ pub fn work(set: &Set, flags: &[&str]) -> PathBuf {
 /// Where an answer is kept, when that is wanted.
 fn cache(name: &str, args: &[String]) -> Option<PathBuf> {
     let folder = PathBuf::from(std::env::var_os("TERRANE_PEER_CACHE")?);
-    let text: String = args.iter().map(|arg| Path::new(arg).file_name().map_or(arg.clone(), |n| n.to_string_lossy().into_owned())).collect::<Vec<_>>().join("_");
+    let text: String = args
+        .iter()
+        .map(|arg| Path::new(arg).file_name().map_or(arg.clone(), |n| n.to_string_lossy().into_owned()))
+        .collect::<Vec<_>>()
+        .join("_");
     let parent = args.first().map(|path| path.replace('/', "_")).unwrap_or_default();
     Some(folder.join(format!("{name}{parent}{text}.json")))
 }

@@ -26,7 +26,16 @@ pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
     let truth = folder.path().join("pairs.txt");
     std::fs::write(&truth, list(&answer.value))?;
     let mut command = Command::new(env!("CARGO"));
-    command.args(["run", "--release", "--package", "terrane-frontend", "--example", "retrieval", "--", "--truth"]);
+    command.args([
+        "run",
+        "--release",
+        "--package",
+        "terrane-frontend",
+        "--example",
+        "retrieval",
+        "--",
+        "--truth",
+    ]);
     command.arg(&truth).arg(set.path()).current_dir(root());
     let (_, text) = process::run(&mut command)?;
     Ok(vec![row(text.lines().next_back().and_then(recall_at_30)).note(answer.note)])

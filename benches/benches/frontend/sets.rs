@@ -26,7 +26,13 @@ pub struct Set {
 
 /// All five, from small to large.
 pub const SETS: &[Set] = &[
-    Set { name: "fountain-P11", folder: "strecha/fountain-P11/images", camera: None, spatial: None, quick: true },
+    Set {
+        name: "fountain-P11",
+        folder: "strecha/fountain-P11/images",
+        camera: None,
+        spatial: None,
+        quick: true,
+    },
     Set {
         name: "castle-P19",
         folder: "strecha/castle-P19/images",
@@ -66,7 +72,8 @@ impl Set {
     /// When the folder or a file can't be read.
     pub fn photographs(&self, limit: usize) -> anyhow::Result<Vec<Photograph>> {
         let folder = self.path();
-        let entries = std::fs::read_dir(&folder).with_context(|| format!("{} is missing", folder.display()))?;
+        let entries =
+            std::fs::read_dir(&folder).with_context(|| format!("{} is missing", folder.display()))?;
         let mut names: Vec<String> =
             entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
         names.sort();
@@ -86,7 +93,11 @@ impl Set {
         let (records, camera_of) = cameras::group(&described, given.as_ref());
         let photographs = described.into_iter().zip(files).zip(camera_of);
         Ok(photographs
-            .map(|(((name, _), bytes), camera)| Photograph { name, bytes, camera: records[camera.index()].clone() })
+            .map(|(((name, _), bytes), camera)| Photograph {
+                name,
+                bytes,
+                camera: records[camera.index()].clone(),
+            })
             .collect())
     }
 }

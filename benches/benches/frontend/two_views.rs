@@ -27,7 +27,9 @@ pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
     for set in SETS.iter().filter(|set| set.quick || !request.quick) {
         let answer = peer::frontend(set, &[]);
         let Some(theirs) = answer.as_ref().and_then(|answer| inliers_by_pair(&answer.value)) else {
-            rows.push(Row::new(format!("{}: inliers", set.name), None, "", Bar::None).note("COLMAP did not run"));
+            rows.push(
+                Row::new(format!("{}: inliers", set.name), None, "", Bar::None).note("COLMAP did not run"),
+            );
             continue;
         };
         let photographs = set.photographs(usize::MAX)?;
@@ -37,8 +39,18 @@ pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
         ratios.extend(compared.ratios);
         milliseconds.extend(compared.verification_ms);
     }
-    rows.push(Row::new("inliers over COLMAP's, median over all pairs", median(&mut ratios), "", Bar::AtLeast(1.0)));
-    rows.push(Row::new("verification, median over all pairs", median(&mut milliseconds), "ms", Bar::AtMost(3.0)));
+    rows.push(Row::new(
+        "inliers over COLMAP's, median over all pairs",
+        median(&mut ratios),
+        "",
+        Bar::AtLeast(1.0),
+    ));
+    rows.push(Row::new(
+        "verification, median over all pairs",
+        median(&mut milliseconds),
+        "ms",
+        Bar::AtMost(3.0),
+    ));
     Ok(rows)
 }
 
@@ -73,16 +85,23 @@ fn compare(photographs: &[Photograph], theirs: &BTreeMap<(String, String), f64>)
         .step_by(step)
         .filter_map(|((a, b), inliers)| Some((place(a)?, place(b)?, *inliers)))
         .collect();
-    let mut compared =
-        Compared { ours: vec![], theirs: vec![], ratios: vec![], verification_ms: vec![], cpu_per_pair_s: 0.0 };
+    let mut compared = Compared {
+        ours: vec![],
+        theirs: vec![],
+        ratios: vec![],
+        verification_ms: vec![],
+        cpu_per_pair_s: 0.0,
+    };
     let mut total_s = 0.0;
     for &(a, b, inliers) in &chosen {
-        let (matching_s, matches) = cpu_of(|| match_features(&features[a], &features[b], &MatchOptions::default()));
+        let (matching_s, matches) =
+            cpu_of(|| match_features(&features[a], &features[b], &MatchOptions::default()));
         let ids = (ImageId(a as u32), ImageId(b as u32));
         let pair = ImagePair::new(ids.0, ids.1).ok_or_else(|| anyhow::anyhow!("a pair of one photograph"))?;
         let view = |at: usize| View { camera: &photographs[at].camera, keypoints: &features[at].keypoints };
         let candidate = Candidate { pair, first: view(a), second: view(b), matches: &matches };
-        let (verification_s, verified) = cpu_of(|| verify(&candidate, &VerificationOptions::default(), Seed(0)));
+        let (verification_s, verified) =
+            cpu_of(|| verify(&candidate, &VerificationOptions::default(), Seed(0)));
         total_s += matching_s + verification_s;
         let ours = verified.map_or(0.0, |pair| pair.matches.len() as f64);
         if ours >= MIN_INLIERS || inliers >= MIN_INLIERS {
@@ -98,10 +117,12 @@ fn compare(photographs: &[Photograph], theirs: &BTreeMap<(String, String), f64>)
 
 fn set_rows(set: &Set, compared: &Compared, their_cpu_s: Option<f64>) -> Vec<Row> {
     let figure = |what: &str| format!("{}: {what}", set.name);
-    let (mut ours, mut theirs, mut ratios) = (compared.ours.clone(), compared.theirs.clone(), compared.ratios.clone());
+    let (mut ours, mut theirs, mut ratios) =
+        (compared.ours.clone(), compared.theirs.clone(), compared.ratios.clone());
     let share = their_cpu_s.map(|theirs| compared.cpu_per_pair_s / theirs);
     let is_named = matches!(set.name, "castle-P19" | "brighton-half");
-    let (inlier_bar, cpu_bar) = if is_named { (Bar::AtLeast(0.98), Bar::AtMost(0.2)) } else { (Bar::None, Bar::None) };
+    let (inlier_bar, cpu_bar) =
+        if is_named { (Bar::AtLeast(0.98), Bar::AtMost(0.2)) } else { (Bar::None, Bar::None) };
     let sums = compared.ours.iter().sum::<f64>() / compared.theirs.iter().sum::<f64>().max(1.0);
     vec![
         Row::new(figure("verified pairs"), Some(ours.len() as f64), "", Bar::None),
@@ -109,7 +130,12 @@ fn set_rows(set: &Set, compared: &Compared, their_cpu_s: Option<f64>) -> Vec<Row
         Row::new(figure("COLMAP's inliers, median"), median(&mut theirs), "", Bar::None),
         Row::new(figure("inliers over COLMAP's, median"), median(&mut ratios), "", inlier_bar),
         Row::new(figure("all inliers over all of COLMAP's"), Some(sums), "", Bar::None),
-        Row::new(figure("match + verify, CPU per pair"), Some(compared.cpu_per_pair_s * 1e3), "ms", Bar::None),
+        Row::new(
+            figure("match + verify, CPU per pair"),
+            Some(compared.cpu_per_pair_s * 1e3),
+            "ms",
+            Bar::None,
+        ),
         Row::new(figure("match + verify, share of COLMAP's CPU"), share, "", cpu_bar),
     ]
 }

@@ -32,7 +32,12 @@ pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
         let figure = |what: &str| format!("{}, front end: {what}", set.name);
         rows.push(Row::new(figure("wall"), Some(wall_s), "s", Bar::None));
         rows.push(Row::new(figure("COLMAP's wall"), theirs("wall_s"), "s", Bar::None).note(note));
-        rows.push(Row::new(figure("share of wall"), theirs("wall_s").map(|s| wall_s / s), "", Bar::AtMost(0.125)));
+        rows.push(Row::new(
+            figure("share of wall"),
+            theirs("wall_s").map(|s| wall_s / s),
+            "",
+            Bar::AtMost(0.125),
+        ));
         rows.push(Row::new(figure("share of CPU"), theirs("cpu_s").map(|s| cpu_s / s), "", Bar::None));
     }
     Ok(rows)

@@ -84,12 +84,9 @@ impl Stage {
             // space in fixed point, kinds of descriptors. Pairs: footprints, ranks. Match: cascade, single-precision
             // screening. Submap: roots of cubics and undistortion in their last bits. Export: what was read beside
             // photographs, and where every artefact of the run is.
-            Stage::Ingest
-            | Stage::Features
-            | Stage::Pairs
-            | Stage::Match
-            | Stage::Submap
-            | Stage::Export => 2,
+            Stage::Ingest | Stage::Features | Stage::Pairs | Stage::Match | Stage::Submap | Stage::Export => {
+                2
+            }
             _ => 1,
         }
     }
