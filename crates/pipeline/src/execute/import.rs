@@ -152,6 +152,7 @@ impl<'a> Join<'a> {
             height_px: camera.height_px,
             orientation: metadata.map(|metadata| metadata.orientation).unwrap_or_default(),
             gps: metadata.and_then(|metadata| metadata.gps),
+            flight: metadata.and_then(|metadata| metadata.flight),
             captured_s: metadata.and_then(|metadata| metadata.captured_s),
             content_hash: photograph.map(|photograph| photograph.content_hash).unwrap_or_default(),
         });
