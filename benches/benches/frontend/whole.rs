@@ -7,7 +7,7 @@ use terrane_benches::table::{Bar, Row};
 use terrane_benches::{Request, process};
 
 use crate::peer;
-use crate::sets::{SETS, Set};
+use crate::sets::SETS;
 
 /// The stages that COLMAP's extraction and matching cover.
 const STAGES: [&str; 4] = ["ingest", "features", "pairs", "match"];

@@ -201,8 +201,9 @@ mod tests {
             assert_eq!(resolve(&flags(&[bad])).unwrap_err().code(), 2, "{bad}");
         }
         assert_eq!(resolve(&OptionFlags { seed: Some(9), ..flags(&["seed=7"]) }).unwrap().seed, 9);
-        let flags = OptionFlags { features: Some(FeatureMethod::Orb), ..flags(&["features.method=surf"]) };
-        assert_eq!(resolve(&flags).unwrap().features.method, FeatureMethod::Orb);
+        let described =
+            OptionFlags { features: Some(FeatureMethod::Orb), ..flags(&["features.method=surf"]) };
+        assert_eq!(resolve(&described).unwrap().features.method, FeatureMethod::Orb);
         let sized = resolve(&OptionFlags { cluster_size: Some(50), ..Default::default() }).unwrap();
         assert_eq!(sized.partition.max_cluster_size, 50);
         let matched =

@@ -276,7 +276,7 @@ impl<'a> Stream<'a> {
     /// Writes `columns` of row `y` of level `s` to its plane, as far as the plane has them.
     fn keep_row(&self, s: usize, y: usize, columns: &Range<usize>, kept: &mut [&mut [u16]]) {
         let step = STEPS[s - 1];
-        if y % step != 0 {
+        if !y.is_multiple_of(step) {
             return;
         }
         let row = &self.images[s].row(y)[columns.start..columns.end.next_multiple_of(step)];

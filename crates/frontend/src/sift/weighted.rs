@@ -66,9 +66,9 @@ macro_rules! vector_path {
                 let mut sum = [$splat(terms.len() as i16 / 2); VECTORS];
                 for term in terms {
                     let weight = $splat(term.weight as i16);
+                    let pixels = *block(term, index * BLOCK);
                     // SAFETY: both are plain bits, any are valid, and `transmute` checks the sizes.
-                    let pixels: [$vector; VECTORS] =
-                        unsafe { std::mem::transmute(*block(term, index * BLOCK)) };
+                    let pixels: [$vector; VECTORS] = unsafe { std::mem::transmute(pixels) };
                     for (sum, pixels) in sum.iter_mut().zip(pixels) {
                         *sum = $add(*sum, $multiply(pixels, weight));
                     }

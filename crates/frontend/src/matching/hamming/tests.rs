@@ -2,7 +2,7 @@
 
 use rand::RngExt;
 use terrane_geometry::Seed;
-use terrane_scene::{DescriptorKind, Keypoint};
+use terrane_scene::{DescriptorKind, Features, Keypoint};
 
 use super::super::match_features;
 use super::*;

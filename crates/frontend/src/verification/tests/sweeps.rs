@@ -150,6 +150,7 @@ fn guidance_finds_what_the_ratio_test_refused() {
         keypoints: keypoints.to_vec(),
         descriptors,
         colors: vec![[0; 3]; 600],
+        ..Features::default()
     };
     let (first, second) = (features(&scene.first, one), features(&scene.second, other));
     let found = |guided| {
