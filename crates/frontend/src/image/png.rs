@@ -44,8 +44,10 @@ pub(super) fn probe(bytes: &[u8]) -> Result<(u32, u32), FrontendError> {
         6 => 4,
         _ => 1,
     };
+    // A forged header may state any size.
     let row_bytes = 1 + (u64::from(size.0) * channels * u64::from(*depth)).div_ceil(8);
-    check_plausible(Format::Png, bytes.len(), row_bytes * u64::from(size.1), MAX_RATIO)?;
+    let num_bytes = row_bytes.saturating_mul(u64::from(size.1));
+    check_plausible(Format::Png, bytes.len(), num_bytes, MAX_RATIO)?;
     Ok(size)
 }
 
