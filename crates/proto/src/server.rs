@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use tokio::net::TcpListener;
-use tokio_stream::wrappers::TcpListenerStream;
+use tonic::transport::server::TcpIncoming;
 use tonic::{Request, Response, Status as Wire};
 
 use crate::client::program;
@@ -111,12 +111,14 @@ pub async fn serve<S: WorkerCalls + ClientCalls>(
     let guarded = tonic::service::interceptor::InterceptedService::new(inner, move |request| {
         admit(token.as_ref(), request)
     });
+    // On the listener: the builder's own setting does not reach a listener that was bound elsewhere, and every answer would wait
+    // 40 ms for an acknowledgement.
+    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
     tonic::transport::Server::builder()
-        .tcp_nodelay(true)
         .http2_keepalive_interval(Some(Duration::from_secs(10)))
         .http2_keepalive_timeout(Some(Duration::from_secs(20)))
         .add_service(guarded)
-        .serve_with_incoming_shutdown(TcpListenerStream::new(listener), shutdown)
+        .serve_with_incoming_shutdown(incoming, shutdown)
         .await
         .map_err(|error| ProtoError::unreachable(format!("the coordinator's listener failed: {error}")))
 }
