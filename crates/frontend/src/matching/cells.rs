@@ -9,6 +9,11 @@ use super::sweep::closest::{Guessed, NOBODY, closest};
 /// Descriptors of a cell, on average.
 const CELL_SIZE: usize = 64;
 
+/// Members of a cell that are guessed at, for each that looks into it.
+const GUESSES: usize = 2;
+/// Most cells that one looks into.
+pub(super) const MOST_PROBES: usize = 6;
+
 /// Cells of an image. Leaders are descriptors at equal steps; each descriptor goes to the leader that seems nearest.
 pub(super) struct Cells {
     leaders: Vec<u32>,
@@ -38,7 +43,7 @@ impl Cells {
         let leaders_guessed = guessed(&leaders);
         let mut members = vec![Vec::new(); num_leaders];
         let bases = sketches.score_bases(sketches);
-        let nearest = closest(&sketches.coarse.codes, &leaders_guessed, &gathered(&bases, &leaders));
+        let nearest = closest::<1>(&sketches.coarse.codes, &leaders_guessed, &gathered(&bases, &leaders));
         for (at, found) in nearest.iter().enumerate() {
             if let Some(cell) = members.get_mut(found[0] as usize) {
                 cell.push(at as u32);
@@ -50,7 +55,7 @@ impl Cells {
 }
 
 /// For each descriptor of two images the two nearest among some of the other's: of those that seem nearest in each of
-/// the `num_probes` cells that it would go to, and of those that found it.
+/// the `num_probes` cells, at most [`MOST_PROBES`], that it would go to, and of those that found it.
 pub(super) fn near(first: Image<'_>, second: Image<'_>, num_probes: usize) -> (Vec<Two>, Vec<Two>) {
     let mut rows = vec![Two::default(); first.descriptors.len()];
     let mut columns = vec![Two::default(); second.descriptors.len()];
@@ -63,17 +68,13 @@ fn probe(from: Image<'_>, into: Image<'_>, num_probes: usize, from_best: &mut [T
     let bases = into.sketches.score_bases(from.sketches);
     let codes = &from.sketches.coarse.codes;
     let leader_bases = gathered(&bases, &into.cells.leaders);
-    let mut arrivals = vec![Vec::new(); into.cells.cells.len()];
-    for (at, found) in closest(codes, &into.cells.leaders_guessed, &leader_bases).iter().enumerate() {
-        for leader in &found[..num_probes.min(found.len())] {
-            if let Some(arrivals) = arrivals.get_mut(*leader as usize) {
-                arrivals.push(at as u32);
-            }
-        }
-    }
-    let (mut pairs, mut squared) = (Vec::new(), Vec::new());
-    for (cell, arrivals) in into.cells.cells.iter().zip(&arrivals) {
-        let guesses = closest(&gathered(codes, arrivals), &cell.guessed, &gathered(&bases, &cell.members));
+    let leaders = closest::<MOST_PROBES>(codes, &into.cells.leaders_guessed, &leader_bases);
+    let arrivals = Arrivals::new(&leaders, num_probes, into.cells.cells.len());
+    let (mut rows, mut columns, mut pairs, mut squared) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    for (cell, arrivals) in into.cells.cells.iter().zip(arrivals.by_cell()) {
+        gather(codes, arrivals, &mut rows);
+        gather(&bases, &cell.members, &mut columns);
+        let guesses = closest::<GUESSES>(&rows, &cell.guessed, &columns);
         pairs.clear();
         for (&at, guesses) in arrivals.iter().zip(&guesses) {
             let known = guesses.iter().filter(|&&guess| guess != NOBODY);
@@ -87,43 +88,83 @@ fn probe(from: Image<'_>, into: Image<'_>, num_probes: usize, from_best: &mut [T
     }
 }
 
-/// The two nearest so far, which may be offered more than once.
+/// Who looks into which cell: by cell, and in each in rising order.
+struct Arrivals {
+    /// Where each cell's begin, and where the last one's end.
+    starts: Vec<u32>,
+    all: Vec<u32>,
+}
+
+impl Arrivals {
+    /// `leaders` are the cells that each would go to, the first `num_probes` of which it does.
+    fn new<const N: usize>(leaders: &[[u32; N]], num_probes: usize, num_cells: usize) -> Self {
+        let visits = |at: usize| leaders[at][..num_probes].iter().take_while(|&&leader| leader != NOBODY);
+        let mut starts = vec![0; num_cells + 1];
+        (0..leaders.len()).flat_map(visits).for_each(|&leader| starts[leader as usize + 1] += 1);
+        let mut sum = 0;
+        for start in &mut starts {
+            sum += *start;
+            *start = sum;
+        }
+        let mut next = starts.clone();
+        let mut all = vec![0; sum as usize];
+        for at in 0..leaders.len() {
+            for &leader in visits(at) {
+                let place = &mut next[leader as usize];
+                all[*place as usize] = at as u32;
+                *place += 1;
+            }
+        }
+        Self { starts, all }
+    }
+
+    fn by_cell(&self) -> impl Iterator<Item = &[u32]> {
+        self.starts.windows(2).map(|bounds| &self.all[bounds[0] as usize..bounds[1] as usize])
+    }
+}
+
+/// The two nearest so far, which may be offered more than once: a squared distance above the place of each.
 #[derive(Clone, Copy)]
 pub(super) struct Two {
-    first: (u32, u32),
-    second: (u32, u32),
+    first: u64,
+    second: u64,
 }
 
 impl Default for Two {
     fn default() -> Self {
-        Self { first: (u32::MAX, NOBODY), second: (u32::MAX, NOBODY) }
+        Self { first: u64::MAX, second: u64::MAX }
     }
 }
 
 impl Two {
+    /// Without branches: which of the two is beaten can't be foretold.
+    #[inline]
     fn offer(&mut self, at: u32, distance: u32) {
-        if distance >= self.second.0 || at == self.first.1 {
-            return;
-        }
-        self.second = (distance, at);
-        if distance < self.first.0 {
-            std::mem::swap(&mut self.first, &mut self.second);
-        }
+        let offered = u64::from(distance) << 32 | u64::from(at);
+        let other = if offered == self.first { u64::MAX } else { offered };
+        self.second = self.second.min(self.first.max(other));
+        self.first = self.first.min(other);
     }
 
     pub(super) fn second_squared(&self) -> u32 {
-        self.second.0
+        (self.second >> 32) as u32
     }
 
     pub(super) fn neighbour(&self) -> Neighbour {
-        Neighbour {
-            index: (self.first.0 < self.second.0).then_some(self.first.1),
-            distance_squared: self.first.0,
-            second_squared: self.second.0,
-        }
+        let distance_squared = (self.first >> 32) as u32;
+        let second_squared = self.second_squared();
+        let index = (distance_squared < second_squared).then_some(self.first as u32);
+        Neighbour { index, distance_squared, second_squared }
     }
 }
 
 fn gathered<T: Copy>(all: &[T], at: &[u32]) -> Vec<T> {
-    at.iter().map(|&at| all[at as usize]).collect()
+    let mut out = Vec::new();
+    gather(all, at, &mut out);
+    out
+}
+
+fn gather<T: Copy>(all: &[T], at: &[u32], out: &mut Vec<T>) {
+    out.clear();
+    out.extend(at.iter().map(|&at| all[at as usize]));
 }

@@ -7,7 +7,7 @@
 use std::arch::x86_64::*;
 use std::ops::Range;
 
-use super::closest::{GUESSES, LANES, best_lanes};
+use super::closest::{LANES, NOBODY};
 use super::{CHUNK, Limits, MOST_SURVIVORS};
 use crate::matching::sketch::{Code, SKETCH_LEN};
 
@@ -229,7 +229,7 @@ fn rejected(
 }
 
 /// See [`closest`](super::closest).
-pub(super) fn closest(rows: &[Code], columns: &Columns, bases: &[i16]) -> Vec<[u32; GUESSES]> {
+pub(super) fn closest<const N: usize>(rows: &[Code], columns: &Columns, bases: &[i16]) -> Vec<[u32; N]> {
     assert!(is_available(), "this path needs AVX2");
     assert!(bases.len() == columns.len);
     let mut starts = columns.starts.clone();
@@ -237,22 +237,22 @@ pub(super) fn closest(rows: &[Code], columns: &Columns, bases: &[i16]) -> Vec<[u
         // An absent column's score is never better than none.
         *start = bases.get(at).map_or(i16::MIN, |base| start.wrapping_sub(SHIFT as i16).wrapping_sub(*base));
     }
-    let mut found = Vec::with_capacity(rows.len().next_multiple_of(ROWS));
-    for rows in rows.chunks(ROWS) {
+    let mut found = vec![[0; N]; rows.len()];
+    for (rows, found) in rows.chunks(ROWS).zip(found.chunks_mut(ROWS)) {
         // SAFETY: the processor has AVX2 (asserted).
-        let (best, at) = unsafe { best_of_lanes(&strip_of(rows), &columns.blocks, &starts) };
-        found.extend((0..rows.len()).map(|row| best_lanes(&best[row], &at[row])));
+        unsafe { best_of_lanes(&strip_of(rows), &columns.blocks, &starts, found) };
     }
     found
 }
 
-/// Of each row the best score of each lane and the group that it is from, or −1.
+/// Of each row the columns of the best lanes; of each lane its best column counts.
 #[target_feature(enable = "avx2")]
-fn best_of_lanes(
+fn best_of_lanes<const N: usize>(
     rows: &[[u32; ROWS]; PAIRS],
     blocks: &[Block],
     starts: &[[i16; WIDTH]],
-) -> ([[i16; LANES]; ROWS], [[i16; LANES]; ROWS]) {
+    found: &mut [[u32; N]],
+) {
     let mut best = [[_mm256_set1_epi16(i16::MIN); GROUP]; ROWS];
     let mut at = [[_mm256_set1_epi16(-1); GROUP]; ROWS];
     let groups = blocks.as_chunks::<GROUP>().0.iter().zip(starts.as_chunks::<GROUP>().0);
@@ -267,7 +267,54 @@ fn best_of_lanes(
             }
         }
     }
-    (bytemuck::must_cast(best), bytemuck::must_cast(at))
+    for ((found, best), at) in found.iter_mut().zip(best).zip(at) {
+        *found = best_columns(best, at);
+    }
+}
+
+/// Lanes in rising order.
+const LANE_NUMBERS: [[i16; WIDTH]; GROUP] = {
+    let mut numbers = [[0; WIDTH]; GROUP];
+    let mut lane = 0;
+    while lane < LANES {
+        numbers[lane / WIDTH][lane % WIDTH] = lane as i16;
+        lane += 1;
+    }
+    numbers
+};
+
+/// The columns of the best lanes, the first of equals.
+#[target_feature(enable = "avx2")]
+#[inline]
+fn best_columns<const N: usize>(mut best: [__m256i; GROUP], at: [__m256i; GROUP]) -> [u32; N] {
+    let group_of: [i16; LANES] = bytemuck::must_cast(at);
+    // Turns the order of signed numbers round into that of unsigned ones, of which the least can be asked for.
+    let turn = _mm_set1_epi16(i16::MAX);
+    let mut left = u32::MAX;
+    let mut columns = [NOBODY; N];
+    for column in &mut columns {
+        let of_both = _mm256_max_epi16(best[0], best[1]);
+        let of_eight = _mm_max_epi16(_mm256_castsi256_si128(of_both), _mm256_extracti128_si256::<1>(of_both));
+        let greatest = _mm_xor_si128(_mm_minpos_epu16(_mm_xor_si128(of_eight, turn)), turn);
+        let greatest = _mm256_broadcastw_epi16(greatest);
+        let (low, high) = (_mm256_cmpeq_epi16(best[0], greatest), _mm256_cmpeq_epi16(best[1], greatest));
+        // Packing takes eight lanes of either in turn.
+        let equal = _mm256_permute4x64_epi64::<0b11_01_10_00>(_mm256_packs_epi16(low, high));
+        let equal = _mm256_movemask_epi8(equal) as u32 & left;
+        let lane = (equal | 1 << (LANES - 1)).trailing_zeros() as usize;
+        let group = group_of[lane];
+        if equal == 0 || group < 0 {
+            break;
+        }
+        *column = group as u32 * LANES as u32 + lane as u32;
+        left &= !(1 << lane);
+        let taken = _mm256_set1_epi16(lane as i16);
+        for (best, numbers) in best.iter_mut().zip(&LANE_NUMBERS) {
+            let is_taken = _mm256_cmpeq_epi16(load(numbers), taken);
+            *best = _mm256_blendv_epi8(*best, _mm256_set1_epi16(i16::MIN), is_taken);
+        }
+    }
+    columns
 }
 
 /// Products added to where their sums begin. Rows are written out, so that all sums stay in registers.

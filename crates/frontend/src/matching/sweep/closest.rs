@@ -11,8 +11,6 @@ use super::avx2;
 
 /// Lanes that columns are dealt to.
 pub(super) const LANES: usize = 32;
-/// Guesses at a row's neighbours.
-pub(in crate::matching) const GUESSES: usize = 3;
 /// No column.
 pub(in crate::matching) const NOBODY: u32 = u32::MAX;
 
@@ -34,8 +32,12 @@ impl Guessed {
     }
 }
 
-/// The best columns of each row, best first. There are as many bases as columns.
-pub(in crate::matching) fn closest(rows: &[Code], columns: &Guessed, bases: &[i16]) -> Vec<[u32; GUESSES]> {
+/// The best `N` columns of each row, best first. There are as many bases as columns.
+pub(in crate::matching) fn closest<const N: usize>(
+    rows: &[Code],
+    columns: &Guessed,
+    bases: &[i16],
+) -> Vec<[u32; N]> {
     match columns {
         Guessed::Scalar(columns) => rows.iter().map(|row| of_row(row, columns, bases)).collect(),
         #[cfg(target_arch = "x86_64")]
@@ -43,7 +45,7 @@ pub(in crate::matching) fn closest(rows: &[Code], columns: &Guessed, bases: &[i1
     }
 }
 
-fn of_row(row: &Code, columns: &[Code], bases: &[i16]) -> [u32; GUESSES] {
+fn of_row<const N: usize>(row: &Code, columns: &[Code], bases: &[i16]) -> [u32; N] {
     let mut best = [i16::MIN; LANES];
     let mut at = [-1; LANES];
     for (column, (code, base)) in columns.iter().zip(bases).enumerate() {
@@ -54,21 +56,49 @@ fn of_row(row: &Code, columns: &[Code], bases: &[i16]) -> [u32; GUESSES] {
             at[column % LANES] = (column / LANES) as i16;
         }
     }
-    best_lanes(&best, &at)
+    let mut lanes: Vec<usize> = (0..LANES).filter(|&lane| at[lane] >= 0).collect();
+    lanes.sort_by_key(|&lane| (std::cmp::Reverse(best[lane]), lane));
+    let column = |lane: &usize| at[*lane] as u32 * LANES as u32 + *lane as u32;
+    std::array::from_fn(|place| lanes.get(place).map_or(NOBODY, column))
 }
 
-/// The best of each lane's best, as columns.
-pub(super) fn best_lanes(best: &[i16; LANES], at: &[i16; LANES]) -> [u32; GUESSES] {
-    // A score above its lane, counted from the end: one comparison orders both, and none of them branches.
-    let mut keys = [i32::MIN; GUESSES];
-    for lane in 0..LANES {
-        let mut key = (i32::from(best[lane]) << 16) | (LANES - 1 - lane) as i32;
-        for place in &mut keys {
-            (*place, key) = ((*place).max(key), (*place).min(key));
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Codes of some values, many of them level or at the ends of their range.
+    fn codes(count: usize, (least, greatest): (i8, i8), mut state: u32) -> Vec<Code> {
+        let mut value = |kind: usize| {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            match kind % 5 {
+                0 => least,
+                1 => greatest,
+                2 => 0,
+                _ => ((state >> 16) % 41) as i8 - 20,
+            }
+        };
+        (0..count).map(|k| std::array::from_fn(|i| value(7 * k + i * k % 11))).collect()
+    }
+
+    #[test]
+    fn every_path_guesses_the_same_columns() {
+        let rows = codes(37, (-64, 63), 5);
+        for count in [0, 1, 2, 31, 32, 33, 64, 65, 150, 2000] {
+            let mut columns = codes(count, (-127, 127), 9);
+            // Copies are level in every row.
+            if count > 64 {
+                columns[40] = columns[3];
+                columns[35] = columns[3];
+            }
+            let bases: Vec<i16> = (0..count).map(|k| [0, 40, -32_768, 32_767, 900][k % 5]).collect();
+            let scalar = closest::<5>(&rows, &Guessed::new(&columns, false), &bases);
+            assert!(
+                scalar.iter().all(|guesses| guesses.iter().filter(|g| **g != NOBODY).count() == count.min(5))
+            );
+            #[cfg(target_arch = "x86_64")]
+            if avx2::is_available() {
+                assert_eq!(closest::<5>(&rows, &Guessed::new(&columns, true), &bases), scalar, "{count}");
+            }
         }
     }
-    keys.map(|key| {
-        let lane = LANES - 1 - (key & 0xffff) as usize % LANES;
-        if at[lane] < 0 { NOBODY } else { at[lane] as u32 * LANES as u32 + lane as u32 }
-    })
 }
