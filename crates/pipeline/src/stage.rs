@@ -80,13 +80,12 @@ impl Stage {
     /// so that no artefact of an older program is taken for today's.
     pub fn version(self) -> u32 {
         match self {
-            // Ingest: XMP, masks, imports, TIFF and narrow 16-bit images. Features: colours are means of 2 x 2 pixels, scale
-            // space in fixed point, kinds of descriptors. Pairs: footprints, ranks. Match: cascade, single-precision
-            // screening. Submap: roots of cubics and undistortion in their last bits. Export: what was read beside
-            // photographs, and where every artefact of the run is.
-            Stage::Ingest | Stage::Features | Stage::Pairs | Stage::Match | Stage::Submap | Stage::Export => {
-                2
-            }
+            // Ingest: XMP, masks, imports, TIFF and narrow 16-bit images. Pairs: footprints, ranks. Submap: roots of cubics
+            // and undistortion in their last bits. Export: what was read beside photographs, and where every artefact of
+            // the run is.
+            Stage::Ingest | Stage::Pairs | Stage::Submap | Stage::Export => 2,
+            // Features: limits count blobs. Match: more cells are looked into.
+            Stage::Features | Stage::Match => 3,
             _ => 1,
         }
     }

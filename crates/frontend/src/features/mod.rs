@@ -118,6 +118,18 @@ impl FeatureOptions {
         }
     }
 
+    /// The most features of a photograph.
+    pub fn most_features(&self) -> usize {
+        match self.method {
+            FeatureMethod::Sift => self.sift.most_features(),
+            FeatureMethod::SiftUpright => self.sift.max_features as usize,
+            FeatureMethod::Harris | FeatureMethod::Fast | FeatureMethod::Orb => {
+                self.corners.max_features as usize
+            }
+            FeatureMethod::Surf | FeatureMethod::SurfUpright => self.surf.max_features as usize,
+        }
+    }
+
     /// These options with the defaults in place of those that the method does not read: equal for equal results.
     pub fn that_matter(&self) -> Self {
         let mut options = Self { method: self.method, ..Self::default() };

@@ -19,6 +19,7 @@ mod options;
 mod rows;
 mod select;
 pub(crate) mod shared;
+mod space;
 #[cfg(test)]
 mod tests;
 mod weighted;
@@ -29,17 +30,14 @@ use terrane_scene::{DESCRIPTOR_LEN, DescriptorKind, Features, Keypoint};
 use crate::Mask;
 use crate::image::{GrayImage, RgbImage};
 use descriptor::{describe, orientations};
-use extrema::{Extremum, Thresholds};
-use gradient::Place;
+use extrema::Extremum;
 use isa::Isa;
-use octave::{Base, LEVELS, Octave, TILE_COLUMNS};
-pub use options::{FirstOctave, SiftOptions};
+use octave::TILE_COLUMNS;
+pub use options::{FirstOctave, SMALL_PIXELS, SiftOptions};
 use select::{Placed, Ranked, first_at_places, select};
+use space::{Blob, Paths, ScaleSpace};
 
-/// The shortest side of an octave, in its pixels.
-const MIN_SIDE: usize = 12;
-
-/// Finds and describes the features of a photograph, in falling strength, at most `options.max_features`.
+/// Finds and describes the features of a photograph, in falling strength, of at most `options.max_features` blobs.
 ///
 /// Colours are looked up in `rgb`, or are the grey of `luma` when there is none. A photograph that is too small or
 /// without texture has no features; that is no error.
@@ -55,138 +53,97 @@ pub fn extract_masked(
     mask: Option<&Mask>,
     options: &SiftOptions,
 ) -> Features {
-    extract_with((Isa::detect(), TILE_COLUMNS), luma, rgb, mask, options)
+    let paths = Paths { isa: Isa::detect(), tile_columns: TILE_COLUMNS };
+    extract_with(paths, luma, rgb, mask, options)
 }
 
 fn extract_with(
-    (isa, tile_columns): (Isa, usize),
+    paths: Paths,
     luma: &GrayImage,
     rgb: Option<&RgbImage>,
     mask: Option<&Mask>,
     options: &SiftOptions,
 ) -> Features {
-    let octaves = scale_space(isa, luma, options, tile_columns);
-    let blobs = strongest(&octaves, luma, mask, options);
-    let oriented = orient(isa, &octaves, &blobs, luma, options);
+    let mut space = ScaleSpace::new(paths, luma, options);
+    let mut blobs = strongest(&space, luma, mask, options);
+    let is_small = luma.width * luma.height <= SMALL_PIXELS;
+    let is_short = blobs.len() < options.max_features as usize;
+    if options.first_octave == FirstOctave::Auto && is_small && is_short && !space.is_empty() {
+        space.add_doubled(paths, luma, options);
+        blobs = strongest(&space, luma, mask, options);
+    }
+    let isa = paths.isa;
+    let oriented = orient(isa, &space, &blobs, luma, options);
     let descriptors: Vec<[u8; DESCRIPTOR_LEN]> = by_place(
         &oriented,
         |(blob, _)| blob,
-        |(blob, orientation_rad)| describe(isa, &blob.place(&octaves), *orientation_rad),
+        |(blob, orientation_rad)| describe(isa, &space.place(blob), *orientation_rad),
     );
     let keypoints: Vec<Keypoint> =
-        oriented.iter().map(|(blob, orientation_rad)| blob.keypoint(options, *orientation_rad)).collect();
+        oriented.iter().map(|(blob, orientation_rad)| keypoint(&space, blob, *orientation_rad)).collect();
     let colors = keypoints.iter().map(|keypoint| color_at(keypoint, luma, rgb)).collect();
     let kind = DescriptorKind::Bytes128;
     Features { keypoints, kind, descriptors: descriptors.into_flattened(), colors }
 }
 
-/// All octaves, finest first.
-fn scale_space(isa: Isa, luma: &GrayImage, options: &SiftOptions, tile_columns: usize) -> Vec<Octave> {
-    let mut octaves: Vec<Octave> = Vec::new();
-    if luma.data.len() != luma.width * luma.height || luma.data.is_empty() {
-        return octaves;
-    }
-    let thresholds = Thresholds::new(255.0 * options.contrast_threshold, options.edge_threshold);
-    for _ in 0..options.num_octaves {
-        let doubled = options.first_octave == FirstOctave::Doubled;
-        let base = match octaves.last() {
-            None => Base::Photo { photo: luma, doubled },
-            Some(octave) => Base::Kept(&octave.levels[LEVELS - 1]),
-        };
-        let size = base.size();
-        if size.width.min(size.height) < MIN_SIDE {
-            break;
-        }
-        let octave = octave::run(isa, base, &thresholds, tile_columns);
-        octaves.push(octave);
-    }
-    octaves
+fn keypoint(space: &ScaleSpace, blob: &Blob, orientation_rad: f32) -> Keypoint {
+    let step_px = space.step_px(blob.octave);
+    let Extremum { x, y, sigma, .. } = blob.extremum;
+    Keypoint { x_px: x * step_px + 0.5, y_px: y * step_px + 0.5, scale_px: sigma * step_px, orientation_rad }
 }
 
-/// An extremum and the octave that it was found in.
-#[derive(Clone, Copy)]
-struct Blob {
-    octave: usize,
-    extremum: Extremum,
+/// Height of the extremum times the blob's area. Noise and blur reach fine blobs first, so that of two equally high the
+/// coarser is found again more often; without the area, twice as many are lost when the scale changes.
+fn strength(space: &ScaleSpace, blob: &Blob) -> f32 {
+    let scale_px = blob.extremum.sigma * space.step_px(blob.octave);
+    blob.extremum.response * scale_px * scale_px
 }
 
-impl Blob {
-    fn place<'a>(&self, octaves: &'a [Octave]) -> Place<'a> {
-        let Extremum { x, y, sigma, level, .. } = self.extremum;
-        let plane = &octaves[self.octave].levels[usize::from(level) - 1];
-        let scale = 1.0 / plane.step as f32;
-        Place { plane, x: scale * x, y: scale * y, sigma: scale * sigma }
-    }
+fn placed(space: &ScaleSpace, blob: &Blob) -> Placed {
+    let Keypoint { x_px, y_px, scale_px, .. } = keypoint(space, blob, 0.0);
+    Placed { x_px, y_px, scale_px, octave: blob.octave, step_px: space.step_px(blob.octave) }
+}
 
-    /// Pixels of the photograph in one of the octave. Pixel i of an octave lies at pixel i * `step` of the photograph,
-    /// whose centre has the coordinate i * `step` + 0.5.
-    fn step(&self, options: &SiftOptions) -> f32 {
-        let step = (1_u32 << self.octave) as f32;
-        if options.first_octave == FirstOctave::Doubled { 0.5 * step } else { step }
-    }
-
-    fn keypoint(&self, options: &SiftOptions, orientation_rad: f32) -> Keypoint {
-        let step = self.step(options);
-        let Extremum { x, y, sigma, .. } = self.extremum;
-        Keypoint { x_px: x * step + 0.5, y_px: y * step + 0.5, scale_px: sigma * step, orientation_rad }
-    }
-
-    /// Height of the extremum times the blob's area. Noise and blur reach fine blobs first, so that of two equally high the
-    /// coarser is found again more often; without the area, twice as many are lost when the scale changes.
-    fn strength(&self, options: &SiftOptions) -> f32 {
-        let scale_px = self.extremum.sigma * self.step(options);
-        self.extremum.response * scale_px * scale_px
-    }
-
-    fn placed(&self, options: &SiftOptions) -> Placed {
-        let Keypoint { x_px, y_px, scale_px, .. } = self.keypoint(options, 0.0);
-        Placed { x_px, y_px, scale_px, octave: self.octave, step_px: self.step(options) }
-    }
-
-    fn ranked(&self, options: &SiftOptions) -> Ranked {
-        let Keypoint { x_px, y_px, .. } = self.keypoint(options, 0.0);
-        Ranked { x_px, y_px }
-    }
+fn ranked(space: &ScaleSpace, blob: &Blob) -> Ranked {
+    let Keypoint { x_px, y_px, .. } = keypoint(space, blob, 0.0);
+    Ranked { x_px, y_px }
 }
 
 /// The blobs that stay, in falling strength.
-fn strongest(octaves: &[Octave], luma: &GrayImage, mask: Option<&Mask>, options: &SiftOptions) -> Vec<Blob> {
-    let mut blobs: Vec<Blob> = octaves
-        .iter()
-        .enumerate()
-        .flat_map(|(octave, found)| found.extrema.iter().map(move |&extremum| Blob { octave, extremum }))
-        .collect();
+fn strongest(space: &ScaleSpace, luma: &GrayImage, mask: Option<&Mask>, options: &SiftOptions) -> Vec<Blob> {
+    let mut blobs = space.blobs();
     blobs.sort_by(|a, b| {
         let (m, n) = (&a.extremum, &b.extremum);
-        b.strength(options)
-            .total_cmp(&a.strength(options))
+        strength(space, b)
+            .total_cmp(&strength(space, a))
             .then(a.octave.cmp(&b.octave))
             .then(m.y.total_cmp(&n.y))
             .then(m.x.total_cmp(&n.x))
             .then(m.sigma.total_cmp(&n.sigma))
     });
-    let places: Vec<Placed> = blobs.iter().map(|blob| blob.placed(options)).collect();
+    let places: Vec<Placed> = blobs.iter().map(|blob| placed(space, blob)).collect();
     let is_first = first_at_places(&places);
     let mut is_first = is_first.iter();
     blobs.retain(|_| is_first.next() == Some(&true));
     if let Some(mask) = mask {
         blobs.retain(|blob| {
-            let Ranked { x_px, y_px } = blob.ranked(options);
+            let Ranked { x_px, y_px } = ranked(space, blob);
             mask.keeps(x_px, y_px)
         });
     }
-    let ranked: Vec<Ranked> = blobs.iter().map(|blob| blob.ranked(options)).collect();
+    let places: Vec<Ranked> = blobs.iter().map(|blob| ranked(space, blob)).collect();
     let size = (luma.width, luma.height);
-    select(&ranked, options.max_features as usize, options.spread, size)
+    select(&places, options.max_features as usize, options.spread, size)
         .into_iter()
         .map(|k| blobs[k])
         .collect()
 }
 
-/// Gives each blob its orientations, of which it may have several, and cuts the result to the limit again.
+/// Gives each blob its orientations, of which it may have several, and cuts the result to half as many again as blobs are
+/// asked for.
 fn orient(
     isa: Isa,
-    octaves: &[Octave],
+    space: &ScaleSpace,
     blobs: &[Blob],
     luma: &GrayImage,
     options: &SiftOptions,
@@ -196,17 +153,14 @@ fn orient(
         |blob| blob,
         |blob| match options.upright {
             true => vec![0.0],
-            false => orientations(isa, &blob.place(octaves), options.max_orientations as usize),
+            false => orientations(isa, &space.place(blob), options.max_orientations as usize),
         },
     );
     let oriented: Vec<(Blob, f32)> =
         blobs.iter().zip(found).flat_map(|(blob, found)| found.into_iter().map(|o| (*blob, o))).collect();
-    let ranked: Vec<Ranked> = oriented.iter().map(|(blob, _)| blob.ranked(options)).collect();
+    let places: Vec<Ranked> = oriented.iter().map(|(blob, _)| ranked(space, blob)).collect();
     let size = (luma.width, luma.height);
-    select(&ranked, options.max_features as usize, options.spread, size)
-        .into_iter()
-        .map(|k| oriented[k])
-        .collect()
+    select(&places, options.most_features(), options.spread, size).into_iter().map(|k| oriented[k]).collect()
 }
 
 /// What `compute` makes of each item, in the items' order. Neighbours in a plane are computed one after another, so that

@@ -13,10 +13,10 @@ pub(super) struct Cost {
 }
 
 const MIB: u64 = 1 << 20;
-/// Bytes of features of one image at most: 8,192 of (16 + 3 + 128).
-const FEATURES_BYTES: u64 = 8192 * 147;
+/// Bytes of a feature: keypoint, colour, descriptor.
+const FEATURE_BYTES: u64 = 16 + 3 + 128;
 /// Bytes of what a matcher lays out of it.
-const PREPARED_BYTES: u64 = 8192 * 400;
+const PREPARED_BYTES: u64 = 400;
 
 fn pixels(table: &ImageTable, image: ImageId) -> u64 {
     let record = table.image(image);
@@ -29,13 +29,18 @@ pub(super) fn ingest(num_files: usize) -> Cost {
 }
 
 /// Features: per thread the pixels (4 bytes), and a scale space of about 44 bytes a pixel of the first octave.
-pub(super) fn features(table: &ImageTable, first: ImageId, count: u32, threads: u32) -> Cost {
+pub(super) fn features(
+    table: &ImageTable,
+    (first, count): (ImageId, u32),
+    most_features: usize,
+    threads: u32,
+) -> Cost {
     let images = || (first.0..first.0 + count).map(ImageId);
     let largest = images().map(|image| pixels(table, image)).max().unwrap_or(0);
     let sum: u64 = images().map(|image| pixels(table, image)).sum();
     Cost {
         bytes: u64::from(threads.min(count)) * largest * 48
-            + u64::from(count) * FEATURES_BYTES * 2
+            + u64::from(count) * most_features as u64 * FEATURE_BYTES * 2
             + 32 * MIB,
         seconds: sum as f64 * 0.5e-6,
     }
@@ -50,9 +55,10 @@ pub(super) fn pairs(num_images: usize) -> Cost {
 
 /// Matching: the features of the block's images, as they are and laid out for the matcher, and what one pair a thread
 /// takes.
-pub(super) fn matching(num_images: usize, num_pairs: usize, threads: u32) -> Cost {
-    let bytes =
-        num_images as u64 * (FEATURES_BYTES * 2 + PREPARED_BYTES) + u64::from(threads) * 32 * MIB + 32 * MIB;
+pub(super) fn matching(num_images: usize, num_pairs: usize, most_features: usize, threads: u32) -> Cost {
+    let bytes = num_images as u64 * most_features as u64 * (FEATURE_BYTES * 2 + PREPARED_BYTES)
+        + u64::from(threads) * 32 * MIB
+        + 32 * MIB;
     Cost { bytes, seconds: 0.05 * num_pairs as f64 }
 }
 

@@ -149,6 +149,7 @@ impl<'a> Planner<'a> {
     ) -> Step<(FeatureSet, Vec<(ImageId, u32, String)>)> {
         let options = &self.config.features;
         let per_batch = options.images_per_task.max(1);
+        let (most_features, threads) = (options.extraction().most_features(), self.config.workers.threads);
         let images = &table.table.images;
         let mut items = Vec::new();
         for (batch, chunk) in images.chunks(per_batch as usize).enumerate() {
@@ -166,7 +167,7 @@ impl<'a> Planner<'a> {
                 key: key.finish(),
                 name: format!("images {} to {}", first.0, first.0 + count - 1),
                 inputs: vec![table_key],
-                cost: predict::features(&table.table, first, count, self.config.workers.threads),
+                cost: predict::features(&table.table, (first, count), most_features, threads),
                 spec: TaskSpec::Features { table: table_key, first, count },
             });
         }
@@ -235,6 +236,7 @@ impl<'a> Planner<'a> {
                 pairs.iter().flat_map(|pair| [pair.first(), pair.second()]).collect();
             images.sort();
             images.dedup();
+            let most_features = self.config.features.extraction().most_features();
             let part = features.only(images.iter().copied());
             let mut key = KeyBuilder::new(Stage::Match)
                 .value(&self.config.matching)?
@@ -254,7 +256,12 @@ impl<'a> Planner<'a> {
                 key: key.finish(),
                 name: format!("block {} of {}: {} pairs", block + 1, blocks.len(), pairs.len()),
                 inputs,
-                cost: predict::matching(images.len(), pairs.len(), self.config.workers.threads),
+                cost: predict::matching(
+                    images.len(),
+                    pairs.len(),
+                    most_features,
+                    self.config.workers.threads,
+                ),
                 spec: TaskSpec::Match {
                     table: table_key,
                     pairs: pairs_key,
