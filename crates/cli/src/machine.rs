@@ -53,7 +53,9 @@ impl Share {
         asked: (Option<NonZeroU32>, Option<NonZeroU32>, Option<u64>),
     ) -> Self {
         let workers = asked.0.map_or(cores.clamp(1, 4), NonZeroU32::get);
-        let threads = asked.1.map_or((cores / workers).max(1), NonZeroU32::get);
+        // Each may use every core: a stage of fewer tasks than workers, or its last task, would leave some idle. Where all
+        // workers are busy, the system shares the cores among them.
+        let threads = asked.1.map_or(cores.max(1), NonZeroU32::get);
         let share = machine_bytes / 4 * 3 / u64::from(workers);
         Self { workers, threads, memory_bytes: asked.2.unwrap_or(share).max(LEAST_MEMORY) }
     }
@@ -67,12 +69,12 @@ mod tests {
     fn defaults_share_the_machine() {
         let share = |cores| Share::of(cores, 16 << 30, (None, None, None));
         assert_eq!(share(1), Share { workers: 1, threads: 1, memory_bytes: 12 << 30 });
-        assert_eq!(share(2), Share { workers: 2, threads: 1, memory_bytes: 6 << 30 });
-        assert_eq!(share(16), Share { workers: 4, threads: 4, memory_bytes: 3 << 30 });
+        assert_eq!(share(2), Share { workers: 2, threads: 2, memory_bytes: 6 << 30 });
+        assert_eq!(share(16), Share { workers: 4, threads: 16, memory_bytes: 3 << 30 });
         let three = NonZeroU32::new(3);
         assert_eq!(
             Share::of(2, 16 << 30, (three, None, Some(1 << 30))),
-            Share { workers: 3, threads: 1, memory_bytes: 1 << 30 }
+            Share { workers: 3, threads: 2, memory_bytes: 1 << 30 }
         );
         assert!(cores() >= 1 && memory_bytes() > 1 << 20 && !worker_name().is_empty());
     }
