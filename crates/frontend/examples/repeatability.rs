@@ -13,7 +13,7 @@ use terrane_frontend::image::{self, GrayImage};
 use terrane_frontend::matching::{MatchOptions, match_features};
 use terrane_frontend::sift::{FirstOctave, SiftOptions, extract};
 use terrane_scene::Features;
-use terrane_testkit::homographies::{Condition, Picture, Score, conditions, score};
+use terrane_testkit::homographies::{Condition, Picture, Score, conditions, num_places, score};
 
 /// The middle of a photograph that pictures are rendered from.
 const MIDDLE_PX: (usize, usize) = (1200, 900);
@@ -43,8 +43,9 @@ fn main() {
         let theirs: Option<Vec<Features>> = peer_dir
             .as_ref()
             .map(|dir: &PathBuf| all.iter().map(|(name, _)| peer::read(&dir.join(name))).collect());
-        // As many features a picture as the peer kept: it counts blobs, not orientations.
-        let budget = |k: usize| theirs.as_ref().map_or(options.max_features, |theirs| theirs[k].len() as u32);
+        // As many blobs a picture as the peer kept.
+        let budget =
+            |k: usize| theirs.as_ref().map_or(options.max_features, |theirs| num_places(&theirs[k]) as u32);
         let ours: Vec<Features> = all
             .iter()
             .enumerate()

@@ -377,6 +377,11 @@ fn repeated(first: &Places, second: &Places, second_features: &Features) -> usiz
     count
 }
 
+/// How many places features stand at; see [`Score::shown`].
+pub fn num_places(features: &Features) -> usize {
+    first_at_place(&features.keypoints).iter().enumerate().filter(|(k, first)| k == *first).count()
+}
+
 /// Of each keypoint the first one that is within a pixel and of nearly the same scale, itself if there is none before.
 fn first_at_place(keypoints: &[Keypoint]) -> Vec<usize> {
     const SAME_PX: f32 = 1.0;
