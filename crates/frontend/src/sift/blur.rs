@@ -8,17 +8,17 @@
 use super::isa::Isa;
 use super::math::exp;
 use super::rows::{MARGIN, MAX_TAPS};
-use super::weighted::{Term, sum_weighted};
+use super::weighted::{Term, WEIGHT_BITS, sum_weighted};
 
 /// The largest error that sparse taps may make, as a part of any grating's contrast.
-const MAX_ALIAS: f64 = 1e-3;
+const MAX_ALIAS: f64 = 3e-4;
 
-/// A symmetric kernel: weights, which add up to 65,536, by distance from its centre in pixels.
+/// A symmetric kernel: weights, which add up to 2¹⁵, by distance from its centre in pixels.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Taps {
     /// Distances rounded down: of a kernel centred between pixels 0 and 1, the pixel 1 lies at 1.
     distances: Vec<isize>,
-    weights: Vec<u16>,
+    weights: Vec<i16>,
 }
 
 impl Taps {
@@ -66,8 +66,8 @@ impl Taps {
         &self,
         isa: Isa,
         center: usize,
-        row: impl Fn(isize) -> &'a [u16],
-        out: &mut [u16],
+        row: impl Fn(isize) -> &'a [i16],
+        out: &mut [i16],
     ) {
         let mut terms = [Term::default(); MAX_TAPS];
         for (term, (distance, weight)) in terms.iter_mut().zip(self.distances.iter().zip(&self.weights)) {
@@ -77,7 +77,7 @@ impl Taps {
     }
 
     /// The blur along a row whose pixel 0 stands at [`MARGIN`].
-    pub(super) fn blur_columns(&self, isa: Isa, padded: &[u16], out: &mut [u16]) {
+    pub(super) fn blur_columns(&self, isa: Isa, padded: &[i16], out: &mut [i16]) {
         let mut terms = [Term::default(); MAX_TAPS];
         for (term, (distance, weight)) in terms.iter_mut().zip(self.distances.iter().zip(&self.weights)) {
             *term = Term { pixels: &padded[MARGIN.wrapping_add_signed(*distance)..], weight: *weight };
@@ -86,22 +86,23 @@ impl Taps {
     }
 }
 
-/// Weights as parts of 65,536; what rounding leaves over goes to the middle.
-fn fixed(exact: &[f64]) -> Vec<u16> {
+/// Weights as parts of 2¹⁵; what rounding leaves over goes to the middle.
+fn fixed(exact: &[f64]) -> Vec<i16> {
+    const ONE: i32 = 1 << WEIGHT_BITS;
     let sum: f64 = exact.iter().sum();
-    let mut weights: Vec<i32> = exact.iter().map(|w| (w / sum * 65_536.0).round() as i32).collect();
-    let rest = 65_536 - weights.iter().sum::<i32>();
+    let mut weights: Vec<i32> = exact.iter().map(|w| (w / sum * f64::from(ONE)).round() as i32).collect();
+    let rest = ONE - weights.iter().sum::<i32>();
     let middle = weights.len() / 2;
     match weights.len() % 2 {
         1 => weights[middle] += rest,
         // A rest is even here, for the kernel is symmetric.
         _ => weights[middle - 1..=middle].iter_mut().for_each(|weight| *weight += rest / 2),
     }
-    weights.into_iter().map(|weight| weight.clamp(0, 65_535) as u16).collect()
+    weights.into_iter().map(|weight| weight.clamp(0, ONE - 1) as i16).collect()
 }
 
 /// Repeats the first and the last of `width` pixels, which start at [`MARGIN`], into the margins.
-pub(super) fn fill_margins(padded: &mut [u16], width: usize) {
+pub(super) fn fill_margins(padded: &mut [i16], width: usize) {
     let first = padded[MARGIN];
     padded[..MARGIN].fill(first);
     let last = padded[MARGIN + width - 1];
@@ -114,8 +115,8 @@ mod tests {
 
     /// What a kernel makes of a grating's contrast, and a Gaussian's exact answer.
     fn responses(taps: &Taps, sigma_px: f64, frequency: f64) -> (f64, f64) {
-        let sum = |(distance, weight): (&isize, &u16)| {
-            f64::from(*weight) / 65_536.0 * (frequency * *distance as f64).cos()
+        let sum = |(distance, weight): (&isize, &i16)| {
+            f64::from(*weight) / 32_768.0 * (frequency * *distance as f64).cos()
         };
         let got = taps.distances.iter().zip(&taps.weights).map(sum).sum();
         (got, (-0.5 * (frequency * sigma_px).powi(2)).exp())
@@ -127,13 +128,13 @@ mod tests {
             let (from, to) =
                 (1.6 * 2.0_f64.powf(level as f64 / 3.0), 1.6 * 2.0_f64.powf((level + 1) as f64 / 3.0));
             let taps = Taps::increment(from, to);
-            assert_eq!(taps.weights.iter().map(|w| u32::from(*w)).sum::<u32>(), 65_536);
-            assert!(taps.distances.len() <= 11 && taps.radius() <= 12);
+            assert_eq!(taps.weights.iter().map(|w| i32::from(*w)).sum::<i32>(), 32_768);
+            assert!(taps.distances.len() <= 15 && taps.radius() <= 15);
             for k in 0..=100 {
                 let frequency = std::f64::consts::PI * f64::from(k) / 100.0;
                 let (got, exact) = responses(&taps, (to * to - from * from).sqrt(), frequency);
                 let held = (-0.5 * (frequency * from).powi(2)).exp();
-                assert!(held * (got - exact).abs() < 1.5e-3, "{level} {frequency}: {got} {exact}");
+                assert!(held * (got - exact).abs() < 5e-4, "{level} {frequency}: {got} {exact}");
             }
         }
     }

@@ -30,11 +30,11 @@ pub(super) struct FirstImage<'a> {
     /// On pixels, and between them for the doubled image.
     phases: Vec<Taps>,
     /// Rows of the photograph with margins; all before `converted` have been in it.
-    source: RowRing<u16>,
+    source: RowRing<i16>,
     converted: usize,
-    padded: Vec<u16>,
-    even: Vec<u16>,
-    odd: Vec<u16>,
+    padded: Vec<i16>,
+    even: Vec<i16>,
+    odd: Vec<i16>,
 }
 
 impl<'a> FirstImage<'a> {
@@ -61,7 +61,7 @@ impl<'a> FirstImage<'a> {
     }
 
     /// Writes row `y`; rows are asked for in order.
-    pub(super) fn row(&mut self, isa: Isa, y: usize, out: &mut [u16]) {
+    pub(super) fn row(&mut self, isa: Isa, y: usize, out: &mut [i16]) {
         let (center, phase) = if self.doubled { (y / 2, y % 2) } else { (y, 0) };
         let vertical = &self.phases[phase];
         let last_row = self.photo.height - 1;
@@ -84,7 +84,7 @@ impl<'a> FirstImage<'a> {
 }
 
 /// A row of the photograph with what stands beside its columns, or the nearest pixel where there is nothing.
-fn convert(isa: Isa, photo: &GrayImage, columns: &Range<usize>, y: usize, out: &mut [u16]) {
+fn convert(isa: Isa, photo: &GrayImage, columns: &Range<usize>, y: usize, out: &mut [i16]) {
     let pixels = &photo.data[y * photo.width..(y + 1) * photo.width];
     let before = columns.start.min(MARGIN);
     let end = (columns.end + MARGIN).min(photo.width);

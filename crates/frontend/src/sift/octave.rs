@@ -15,7 +15,7 @@ use super::extrema::{Detector, Extremum, Thresholds};
 use super::first::{FirstImage, size_of_first};
 use super::isa::Isa;
 use super::math::exp;
-use super::rows::{BLOCK, MARGIN, halve, subtract};
+use super::rows::{BLOCK, MARGIN, from_plane, subtract, to_half_plane, to_plane};
 use crate::image::GrayImage;
 
 /// Levels in which extrema are searched, per octave (Lowe 2004).
@@ -76,7 +76,7 @@ impl<T: Copy + Default> RowRing<T> {
     }
 }
 
-/// A level of an octave in fixed point; see `rows`.
+/// A level of an octave in fixed point; see [`super::rows`].
 pub(super) struct Plane {
     pub size: Size,
     /// Pixels of the octave in one of the plane.
@@ -148,11 +148,11 @@ enum BaseRows<'a> {
 }
 
 impl BaseRows<'_> {
-    fn row(&mut self, isa: Isa, y: usize, out: &mut [u16]) {
+    fn row(&mut self, isa: Isa, y: usize, out: &mut [i16]) {
         match self {
             Self::Photo(image) => image.row(isa, y, out),
             Self::Kept(plane, columns) => {
-                out[..columns.len()].copy_from_slice(&plane.row(y)[columns.clone()]);
+                from_plane(isa, &plane.row(y)[columns.clone()], out);
             }
         }
     }
@@ -219,9 +219,9 @@ struct Stream<'a> {
     blurs: Vec<Taps>,
     /// By how many rows each image trails the first.
     delays: [usize; IMAGES],
-    images: Vec<RowRing<u16>>,
+    images: Vec<RowRing<i16>>,
     differences: Vec<RowRing<i16>>,
-    padded: Vec<u16>,
+    padded: Vec<i16>,
 }
 
 impl<'a> Stream<'a> {
@@ -281,8 +281,8 @@ impl<'a> Stream<'a> {
         }
         let row = &self.images[s].row(y)[columns.start..columns.end.next_multiple_of(step)];
         match step {
-            1 => kept[y].copy_from_slice(row),
-            _ => halve(self.isa, row, kept[y / step]),
+            1 => to_plane(self.isa, row, kept[y]),
+            _ => to_half_plane(self.isa, row, kept[y / step]),
         }
     }
 
