@@ -2,12 +2,10 @@
 
 use terrane_scene::DESCRIPTOR_LEN;
 
-use super::gradient::{
-    CELLS, DIRECTIONS, Frame, Gathered, ORIENTATION_BINS, Place, RIMMED_CELLS, gather_descriptor,
-    gather_orientations,
-};
+use super::gradient::{ORIENTATION_BINS, Place, gather_orientations};
 use super::isa::Isa;
 use super::math::cos_sin;
+use super::patch::{CELLS, DIRECTIONS, PER_CELL, Step, gather_descriptor};
 
 /// Width of a descriptor's cell in standard deviations of the keypoint (Lowe 2004, as in VLFeat).
 const CELL_SIGMAS: f64 = 3.0;
@@ -68,23 +66,13 @@ fn smoothed(histogram: &[f32; ORIENTATION_BINS]) -> [f32; ORIENTATION_BINS] {
 /// descriptor d. Its length is 512 within rounding, so that dot products compare as those of unit vectors do.
 pub(super) fn describe(isa: Isa, place: &Place<'_>, orientation_rad: f32) -> [u8; DESCRIPTOR_LEN] {
     let (cosine, sine) = cos_sin(f64::from(orientation_rad));
-    let cells_per_px = 1.0 / (CELL_SIGMAS * f64::from(place.sigma));
-    let turned = [[cosine, sine], [-sine, cosine]];
-    let frame = Frame {
-        cells_from_px: turned.map(|row| row.map(|v| (v * cells_per_px) as f32)),
-        gradient: turned.map(|row| row.map(|v| v as f32)),
-    };
-    let mut gathered = [[0.0_f32; DIRECTIONS]; RIMMED_CELLS * RIMMED_CELLS];
-    gather_descriptor(isa, place, &frame, &mut gathered);
-    quantized(&without_rim(&gathered))
-}
-
-fn without_rim(gathered: &Gathered) -> [f32; DESCRIPTOR_LEN] {
-    let mut out = [0.0; DESCRIPTOR_LEN];
-    for (cell, out) in out.as_chunks_mut::<DIRECTIONS>().0.iter_mut().enumerate() {
-        *out = gathered[(cell / CELLS + 1) * RIMMED_CELLS + cell % CELLS + 1];
-    }
-    out
+    let step_px = CELL_SIGMAS * f64::from(place.sigma) / PER_CELL as f64;
+    let step = Step { x: (cosine * step_px) as f32, y: (sine * step_px) as f32 };
+    let mut cells = [[0.0_f32; DIRECTIONS]; CELLS * CELLS];
+    gather_descriptor(isa, place, &step, &mut cells);
+    let mut histogram = [0.0; DESCRIPTOR_LEN];
+    histogram.copy_from_slice(cells.as_flattened());
+    quantized(&histogram)
 }
 
 fn quantized(histogram: &[f32; DESCRIPTOR_LEN]) -> [u8; DESCRIPTOR_LEN] {

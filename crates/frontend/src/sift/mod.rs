@@ -16,6 +16,7 @@ mod isa;
 mod math;
 mod octave;
 mod options;
+mod patch;
 mod rows;
 mod select;
 pub(crate) mod shared;
