@@ -6,7 +6,7 @@ usage: colmap_frontend.py IMAGES WORK [--first-octave N] [--max-features N] [--l
 
 WORK/database.db is left behind. Each stage runs in a child of its own, so that its CPU time and peak memory are the stage's. Prints one
 JSON object: `extract` and `match` with wall_s, cpu_s, peak_mib; `images` with the number of features of each; `pairs` with the names
-of both images, how many matches agree with their two-view geometry, and its kind.
+of both images, how many matches agree with their two-view geometry, and its kind; `pairs_tried`, with those that have no geometry.
 """
 import argparse, json, multiprocessing, resource, shutil, sys, time
 from pathlib import Path
@@ -83,6 +83,7 @@ def main():
         result["images"] = {name: found.num_keypoints_for_image(number) for number, name in images.items()}
         if not args.extract_only:
             result["pairs"] = pairs(pycolmap, found, images)
+            result["pairs_tried"] = found.num_matched_image_pairs()
     print(json.dumps(result))
 
 

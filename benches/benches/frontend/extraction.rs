@@ -47,8 +47,8 @@ fn compare(
                 / count,
         )
     });
-    let max_features = features.map_or(8192, |features| features.round() as u32);
-    let options = SiftOptions { max_features, first_octave, ..SiftOptions::default() };
+    let options = SiftOptions { first_octave, ..SiftOptions::default() };
+    let options = as_many(photographs, options, features)?;
     let (seconds, found) = ours(photographs, &options)?;
     let figure = |what: &str| format!("{}, first octave {octave}: {what}", set.name);
     let note = answer.as_ref().map_or("COLMAP did not run", |answer| answer.note);
@@ -60,6 +60,19 @@ fn compare(
             .note(format!("{:.0} features an image; {note}", features.unwrap_or(0.0))),
         Row::new(figure("share of COLMAP's CPU"), ratio, "", Bar::AtMost(0.1)),
     ])
+}
+
+/// Options that give as many features an image as the peer has, for a limit counts blobs.
+fn as_many(
+    photographs: &[Photograph],
+    mut options: SiftOptions,
+    wanted: Option<f64>,
+) -> anyhow::Result<SiftOptions> {
+    let Some(wanted) = wanted else { return Ok(options) };
+    options.max_features = wanted.round() as u32;
+    let (_, found) = ours(&photographs[..1], &options)?;
+    options.max_features = (wanted * wanted / found.max(1.0)).round() as u32;
+    Ok(options)
 }
 
 /// CPU seconds and features per image, one thread.

@@ -24,7 +24,8 @@ pub fn rows(_: &Request) -> anyhow::Result<Vec<Row>> {
     let descriptors: Vec<Vec<Descriptor>> = decoded(&photographs)?
         .iter()
         .map(|image| {
-            sift::extract(&image.luma, None, &options).descriptors.as_chunks::<DESCRIPTOR_LEN>().0.to_vec()
+            let features = sift::extract(&image.luma, None, &options);
+            features.descriptors.as_chunks::<DESCRIPTOR_LEN>().0.iter().copied().take(COUNT).collect()
         })
         .collect();
     let (first, second) = (&descriptors[0], &descriptors[1]);

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use terrane_benches::Request;
 use terrane_benches::table::{Bar, Row};
 use terrane_benches::usage::cpu_of;
-use terrane_frontend::matching::{MatchOptions, match_features};
+use terrane_frontend::matching::{MatchOptions, PreparedImage, match_prepared};
 use terrane_frontend::sift::{self, SiftOptions};
 use terrane_frontend::verification::{Candidate, VerificationOptions, View, verify};
 use terrane_geometry::Seed;
@@ -35,7 +35,9 @@ pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
         let photographs = set.photographs(usize::MAX)?;
         let compared = compare(&photographs, &theirs)?;
         let cpu = answer.as_ref().and_then(|answer| peer::number(&answer.value, &["match", "cpu_s"]));
-        rows.extend(set_rows(set, &compared, cpu.map(|cpu| cpu / theirs.len() as f64)));
+        let tried = answer.as_ref().and_then(|answer| answer.value["pairs_tried"].as_f64());
+        let per_pair = cpu.zip(tried).map(|(cpu, tried)| cpu / tried.max(1.0));
+        rows.extend(set_rows(set, &compared, per_pair));
         ratios.extend(compared.ratios);
         milliseconds.extend(compared.verification_ms);
     }
@@ -92,10 +94,14 @@ fn compare(photographs: &[Photograph], theirs: &BTreeMap<(String, String), f64>)
         verification_ms: vec![],
         cpu_per_pair_s: 0.0,
     };
-    let mut total_s = 0.0;
+    let options = MatchOptions::default();
+    let (preparing_s, prepared) = cpu_of(|| -> Vec<PreparedImage> {
+        features.iter().map(|features| PreparedImage::new(features, &options)).collect()
+    });
+    // Once an image, for all of its pairs.
+    let mut total_s = preparing_s * chosen.len() as f64 / theirs.len().max(1) as f64;
     for &(a, b, inliers) in &chosen {
-        let (matching_s, matches) =
-            cpu_of(|| match_features(&features[a], &features[b], &MatchOptions::default()));
+        let (matching_s, matches) = cpu_of(|| match_prepared(&prepared[a], &prepared[b], &options));
         let ids = (ImageId(a as u32), ImageId(b as u32));
         let pair = ImagePair::new(ids.0, ids.1).ok_or_else(|| anyhow::anyhow!("a pair of one photograph"))?;
         let view = |at: usize| View { camera: &photographs[at].camera, keypoints: &features[at].keypoints };
