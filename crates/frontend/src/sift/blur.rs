@@ -39,6 +39,7 @@ impl Taps {
         Self::spaced(added.sqrt(), spacing, false)
     }
 
+    /// Taps whose weight is rounded to nothing are left out.
     fn spaced(sigma_px: f64, spacing: usize, between: bool) -> Self {
         let start = if between { 0.5 } else { 0.0 };
         let arm = ((4.0 * sigma_px - start) / spacing as f64).ceil().max(0.0) as usize;
@@ -53,7 +54,10 @@ impl Taps {
                 exp(-0.5 * distance * distance)
             })
             .collect();
-        Self { distances, weights: fixed(&exact) }
+        let weights = fixed(&exact);
+        let idle = weights.iter().take_while(|weight| **weight == 0).count();
+        let used = idle..weights.len() - idle;
+        Self { distances: distances[used.clone()].to_vec(), weights: weights[used].to_vec() }
     }
 
     /// How many pixels away from the centre's (rounded down) the kernel looks.
@@ -130,6 +134,7 @@ mod tests {
             let taps = Taps::increment(from, to);
             assert_eq!(taps.weights.iter().map(|w| i32::from(*w)).sum::<i32>(), 32_768);
             assert!(taps.distances.len() <= 15 && taps.radius() <= 15);
+            assert!(taps.weights.iter().all(|weight| *weight > 0));
             for k in 0..=100 {
                 let frequency = std::f64::consts::PI * f64::from(k) / 100.0;
                 let (got, exact) = responses(&taps, (to * to - from * from).sqrt(), frequency);

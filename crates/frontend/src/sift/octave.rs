@@ -27,7 +27,7 @@ pub(super) const BASE_SIGMA: f64 = 1.6;
 /// Columns that a tile has at most, overlaps included: its rings take some 450 bytes a column.
 pub(super) const TILE_COLUMNS: usize = 1024;
 /// Columns by which a tile reaches over its neighbours: the sum of the kernels' radii and what the search looks at.
-const OVERLAP: usize = 48;
+const OVERLAP: usize = 44;
 
 /// Of each level that is kept, every how manieth row and column. The blur of the third is more than three pixels of the
 /// octave, so that half of them hold it; with half of the others, some 2 % of the matches across a rotation were lost, for
