@@ -29,6 +29,7 @@ fn main() {
             "--peer" => peer_dir = Some(PathBuf::from(value())),
             "--max" => options.max_features = value().parse().expect("a number"),
             "--spread" => options.spread = value().parse().expect("a number"),
+            "--contrast" => options.contrast_threshold = value().parse().expect("a number"),
             "--octaves" => options.num_octaves = value().parse().expect("a number"),
             "--first-octave" if value() == "-1" => options.first_octave = FirstOctave::Doubled,
             "--first-octave" => options.first_octave = FirstOctave::Original,
