@@ -25,6 +25,7 @@ fn main() {
     while let Some(argument) = arguments.next() {
         let mut value = || arguments.next().unwrap_or_else(|| panic!("{argument} needs a value"));
         match argument.as_str() {
+            "--affine" => options.affine = true,
             "--pictures" => pictures = PathBuf::from(value()),
             "--peer" => peer_dir = Some(PathBuf::from(value())),
             "--max" => options.max_features = value().parse().expect("a number"),

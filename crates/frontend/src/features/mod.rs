@@ -4,6 +4,7 @@
 //! |---|---|---|
 //! | `sift` | differences of Gaussians | gradients, 128 bytes |
 //! | `sift-upright` | the same | the same, not turned |
+//! | `sift-affine` | the same | the same, of surroundings that are made round |
 //! | `harris` | Harris' measure on a pyramid | gradients, 128 bytes |
 //! | `fast` | segment test on a pyramid | gradients, 128 bytes |
 //! | `orb` | segment test on a pyramid | rotated BRIEF, 256 bits |
@@ -35,6 +36,8 @@ pub enum FeatureMethod {
     Sift,
     /// SIFT that takes the photograph's own axes.
     SiftUpright,
+    /// SIFT with the affine shape of each blob.
+    SiftAffine,
     /// Harris corners described by gradients.
     Harris,
     /// FAST corners described by gradients.
@@ -49,14 +52,23 @@ pub enum FeatureMethod {
 
 impl FeatureMethod {
     /// Every method.
-    pub const ALL: [Self; 7] =
-        [Self::Sift, Self::SiftUpright, Self::Harris, Self::Fast, Self::Orb, Self::Surf, Self::SurfUpright];
+    pub const ALL: [Self; 8] = [
+        Self::Sift,
+        Self::SiftUpright,
+        Self::SiftAffine,
+        Self::Harris,
+        Self::Fast,
+        Self::Orb,
+        Self::Surf,
+        Self::SurfUpright,
+    ];
 
     /// The name in options and flags.
     pub fn name(self) -> &'static str {
         match self {
             Self::Sift => "sift",
             Self::SiftUpright => "sift-upright",
+            Self::SiftAffine => "sift-affine",
             Self::Harris => "harris",
             Self::Fast => "fast",
             Self::Orb => "orb",
@@ -112,7 +124,9 @@ impl FeatureOptions {
     /// Names every field that is out of its range.
     pub fn validate(&self) -> Result<(), FrontendError> {
         match self.method {
-            FeatureMethod::Sift | FeatureMethod::SiftUpright => self.sift.validate(),
+            FeatureMethod::Sift | FeatureMethod::SiftUpright | FeatureMethod::SiftAffine => {
+                self.sift.validate()
+            }
             FeatureMethod::Harris | FeatureMethod::Fast | FeatureMethod::Orb => self.corners.validate(),
             FeatureMethod::Surf | FeatureMethod::SurfUpright => self.surf.validate(),
         }
@@ -121,7 +135,7 @@ impl FeatureOptions {
     /// The most features of a photograph.
     pub fn most_features(&self) -> usize {
         match self.method {
-            FeatureMethod::Sift => self.sift.most_features(),
+            FeatureMethod::Sift | FeatureMethod::SiftAffine => self.sift.most_features(),
             FeatureMethod::SiftUpright => self.sift.max_features as usize,
             FeatureMethod::Harris | FeatureMethod::Fast | FeatureMethod::Orb => {
                 self.corners.max_features as usize
@@ -134,7 +148,9 @@ impl FeatureOptions {
     pub fn that_matter(&self) -> Self {
         let mut options = Self { method: self.method, ..Self::default() };
         match self.method {
-            FeatureMethod::Sift | FeatureMethod::SiftUpright => options.sift = self.sift.clone(),
+            FeatureMethod::Sift | FeatureMethod::SiftUpright | FeatureMethod::SiftAffine => {
+                options.sift = self.sift.clone();
+            }
             FeatureMethod::Harris | FeatureMethod::Fast | FeatureMethod::Orb => {
                 options.corners = self.corners.clone();
             }
@@ -166,6 +182,10 @@ pub fn extract_masked(
         FeatureMethod::Sift => sift::extract_masked(luma, rgb, mask, &options.sift),
         FeatureMethod::SiftUpright => {
             let options = SiftOptions { upright: true, ..options.sift.clone() };
+            sift::extract_masked(luma, rgb, mask, &options)
+        }
+        FeatureMethod::SiftAffine => {
+            let options = SiftOptions { affine: true, ..options.sift.clone() };
             sift::extract_masked(luma, rgb, mask, &options)
         }
         FeatureMethod::Harris => corners(CornerDetector::Harris, CornerDescriptor::Gradients),

@@ -19,6 +19,7 @@ mod options;
 mod patch;
 mod rows;
 mod select;
+mod shape;
 pub(crate) mod shared;
 mod space;
 #[cfg(test)]
@@ -36,6 +37,7 @@ use isa::Isa;
 use octave::TILE_COLUMNS;
 pub use options::{FirstOctave, SMALL_PIXELS, SiftOptions};
 use select::{Placed, Ranked, first_at_places, select};
+use shape::{Shape, Surroundings};
 use space::{Blob, Paths, ScaleSpace};
 
 /// Finds and describes the features of a photograph, in falling strength, of at most `options.max_features` blobs.
@@ -74,17 +76,40 @@ fn extract_with(
         blobs = strongest(&space, luma, mask, options);
     }
     let isa = paths.isa;
-    let oriented = orient(isa, &space, &blobs, luma, options);
+    let seen = seen(&space, blobs, options);
+    let oriented = orient(isa, &space, &seen, luma, options);
     let descriptors: Vec<[u8; DESCRIPTOR_LEN]> = by_place(
         &oriented,
-        |(blob, _)| blob,
-        |(blob, orientation_rad)| describe(isa, &space.place(blob), *orientation_rad),
+        |(seen, _)| &seen.blob,
+        |(seen, orientation_rad)| describe(isa, &seen.surroundings(&space).place(), *orientation_rad),
     );
-    let keypoints: Vec<Keypoint> =
-        oriented.iter().map(|(blob, orientation_rad)| keypoint(&space, blob, *orientation_rad)).collect();
+    let keypoints: Vec<Keypoint> = oriented
+        .iter()
+        .map(|(seen, orientation_rad)| keypoint(&space, &seen.blob, seen.shape.turned(*orientation_rad)))
+        .collect();
     let colors = keypoints.iter().map(|keypoint| color_at(keypoint, luma, rgb)).collect();
     let kind = DescriptorKind::Bytes128;
     Features { keypoints, kind, descriptors: descriptors.into_flattened(), colors }
+}
+
+/// A blob and what it is seen through.
+#[derive(Clone, Copy)]
+struct Seen {
+    blob: Blob,
+    shape: Shape,
+}
+
+impl Seen {
+    fn surroundings<'a>(&self, space: &'a ScaleSpace) -> Surroundings<'a> {
+        Surroundings::of(space.place(&self.blob), &self.shape)
+    }
+}
+
+/// Blobs with their shapes, or round ones where none are asked for.
+fn seen(space: &ScaleSpace, blobs: Vec<Blob>, options: &SiftOptions) -> Vec<Seen> {
+    let shape = |blob: &Blob| if options.affine { Shape::of(&space.place(blob)) } else { Shape::ROUND };
+    let shapes = by_place(&blobs, |blob| blob, shape);
+    blobs.into_iter().zip(shapes).map(|(blob, shape)| Seen { blob, shape }).collect()
 }
 
 fn keypoint(space: &ScaleSpace, blob: &Blob, orientation_rad: f32) -> Keypoint {
@@ -145,21 +170,22 @@ fn strongest(space: &ScaleSpace, luma: &GrayImage, mask: Option<&Mask>, options:
 fn orient(
     isa: Isa,
     space: &ScaleSpace,
-    blobs: &[Blob],
+    blobs: &[Seen],
     luma: &GrayImage,
     options: &SiftOptions,
-) -> Vec<(Blob, f32)> {
+) -> Vec<(Seen, f32)> {
+    let limit = options.max_orientations as usize;
     let found: Vec<Vec<f32>> = by_place(
         blobs,
-        |blob| blob,
-        |blob| match options.upright {
+        |seen| &seen.blob,
+        |seen| match options.upright {
             true => vec![0.0],
-            false => orientations(isa, &space.place(blob), options.max_orientations as usize),
+            false => orientations(isa, &seen.surroundings(space).place(), limit),
         },
     );
-    let oriented: Vec<(Blob, f32)> =
-        blobs.iter().zip(found).flat_map(|(blob, found)| found.into_iter().map(|o| (*blob, o))).collect();
-    let places: Vec<Ranked> = oriented.iter().map(|(blob, _)| ranked(space, blob)).collect();
+    let oriented: Vec<(Seen, f32)> =
+        blobs.iter().zip(found).flat_map(|(seen, found)| found.into_iter().map(|o| (*seen, o))).collect();
+    let places: Vec<Ranked> = oriented.iter().map(|(seen, _)| ranked(space, &seen.blob)).collect();
     let size = (luma.width, luma.height);
     select(&places, options.most_features(), options.spread, size).into_iter().map(|k| oriented[k]).collect()
 }

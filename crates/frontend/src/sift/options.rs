@@ -44,6 +44,9 @@ pub struct SiftOptions {
     pub max_orientations: u32,
     /// Whether features take the photograph's own axes instead of dominant gradients. Default: no.
     pub upright: bool,
+    /// Whether each blob's affine shape is found, so that it is described as if it were seen from the front. Costs about as
+    /// much as all else; keeps more matches between views that are far aslant of each other. Default: no.
+    pub affine: bool,
     /// The part of `max_features` that is spread evenly over the photograph; the rest goes to the strongest. Range: 0 to
     /// 1. Default 0.5.
     pub spread: f64,
@@ -59,6 +62,7 @@ impl Default for SiftOptions {
             edge_threshold: 10.0,
             max_orientations: 2,
             upright: false,
+            affine: false,
             spread: 0.5,
         }
     }

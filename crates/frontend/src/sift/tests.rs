@@ -1,8 +1,10 @@
 //! Features of images with known answers: blobs at known places, textures under known transforms.
 
 use terrane_scene::{Features, Keypoint};
+use terrane_testkit::homographies::{Condition, Picture, conditions, score};
 
 use super::*;
+use crate::matching::{MatchOptions, match_features};
 
 /// A sum of Gaussian blobs on grey, which can be drawn exactly at any place, scale and rotation.
 struct Scene {
@@ -341,4 +343,40 @@ fn options_name_every_field_that_is_wrong() {
     for name in ["max_features", "spread", "edge_threshold"] {
         assert!(error.to_string().contains(name), "{error}");
     }
+}
+
+/// A picture with texture of all scales.
+fn cloth() -> Picture {
+    let (width, height) = (640, 480);
+    let scene = Scene::random(2500, 640.0, 11).draw(width, height, (1.0, 0.0), (0.0, 0.0));
+    Picture { width, height, pixels: scene.data }
+}
+
+/// Right matches of a picture and what a condition makes of it.
+fn right_matches(condition: &Condition, options: &SiftOptions) -> usize {
+    let first = cloth();
+    let second = condition.render(&first, 5);
+    let features = [&first, &second].map(|picture| {
+        let Picture { width, height, ref pixels } = *picture;
+        extract(&GrayImage { width, height, data: pixels.clone() }, None, options)
+    });
+    let matches: Vec<(u32, u32)> = match_features(&features[0], &features[1], &MatchOptions::default())
+        .iter()
+        .map(|m| (m.first, m.second))
+        .collect();
+    let map = condition.second_from_first(first.width, first.height);
+    let size = |picture: &Picture| (picture.width, picture.height);
+    score((&features[0], size(&first)), (&features[1], size(&second)), &matches, &map).correct
+}
+
+#[test]
+fn affine_shapes_keep_matches_of_a_plane_far_aslant_and_most_of_one_seen_from_the_front() {
+    let round = options(FirstOctave::Original);
+    let affine = SiftOptions { affine: true, ..round.clone() };
+    let of = |name: &str| conditions().into_iter().find(|c| c.name == name).expect("a condition");
+    let (aslant, front) = (of("tilt 55°"), of("turn 45°"));
+    let (with, without) = (right_matches(&aslant, &affine), right_matches(&aslant, &round));
+    assert!(10 * with > 11 * without, "{with} {without}");
+    let (with, without) = (right_matches(&front, &affine), right_matches(&front, &round));
+    assert!(10 * with > 8 * without && without > 200, "{with} {without}");
 }
