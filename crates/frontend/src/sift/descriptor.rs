@@ -65,6 +65,11 @@ fn smoothed(histogram: &[f32; ORIENTATION_BINS]) -> [f32; ORIENTATION_BINS] {
 /// RootSIFT (Arandjelović & Zisserman 2012) in eight bits: round(512 √(d / |d|₁)), at most 255, of Lowe's clamped
 /// descriptor d. Its length is 512 within rounding, so that dot products compare as those of unit vectors do.
 pub(super) fn describe(isa: Isa, place: &Place<'_>, orientation_rad: f32) -> [u8; DESCRIPTOR_LEN] {
+    quantized(&root_sift(isa, place, orientation_rad))
+}
+
+/// The descriptor before it is rounded: of length one, or all zeros where there is no gradient.
+pub(super) fn root_sift(isa: Isa, place: &Place<'_>, orientation_rad: f32) -> [f32; DESCRIPTOR_LEN] {
     let (cosine, sine) = cos_sin(f64::from(orientation_rad));
     let step_px = CELL_SIGMAS * f64::from(place.sigma) / PER_CELL as f64;
     let step = Step { x: (cosine * step_px) as f32, y: (sine * step_px) as f32 };
@@ -72,17 +77,17 @@ pub(super) fn describe(isa: Isa, place: &Place<'_>, orientation_rad: f32) -> [u8
     gather_descriptor(isa, place, &step, &mut cells);
     let mut histogram = [0.0; DESCRIPTOR_LEN];
     histogram.copy_from_slice(cells.as_flattened());
-    quantized(&histogram)
-}
-
-fn quantized(histogram: &[f32; DESCRIPTOR_LEN]) -> [u8; DESCRIPTOR_LEN] {
     let length = histogram.iter().map(|v| v * v).sum::<f32>().sqrt();
     if !(length > 0.0) {
-        return [0; DESCRIPTOR_LEN];
+        return [0.0; DESCRIPTOR_LEN];
     }
     let clamped = histogram.map(|v| (v / length).min(CLAMP));
     let sum: f32 = clamped.iter().sum();
+    clamped.map(|v| (v / sum).sqrt())
+}
+
+fn quantized(root_sift: &[f32; DESCRIPTOR_LEN]) -> [u8; DESCRIPTOR_LEN] {
     // Adding it rounds to an integer, ties to even, which then stands in the low bits.
     const MAGIC: f32 = 8_388_608.0;
-    clamped.map(|v| ((QUANTUM * (v / sum).sqrt()).min(255.0) + MAGIC).to_bits() as u8)
+    root_sift.map(|v| ((QUANTUM * v).min(255.0) + MAGIC).to_bits() as u8)
 }

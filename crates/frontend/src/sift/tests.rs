@@ -380,3 +380,71 @@ fn affine_shapes_keep_matches_of_a_plane_far_aslant_and_most_of_one_seen_from_th
     let (with, without) = (right_matches(&front, &affine), right_matches(&front, &round));
     assert!(10 * with > 8 * without && without > 200, "{with} {without}");
 }
+
+/// Descriptors before and after rounding, with their keypoints.
+fn rounded_and_not(picture: &Picture, options: &SiftOptions) -> (Features, [Vec<Vec<f32>>; 2]) {
+    let Picture { width, height, ref pixels } = *picture;
+    let luma = GrayImage { width, height, data: pixels.clone() };
+    let isa = Isa::detect();
+    let space = ScaleSpace::new(Paths { isa, tile_columns: TILE_COLUMNS }, &luma, options);
+    let seen = seen(&space, strongest(&space, &luma, None, options), options);
+    let oriented = orient(isa, &space, &seen, &luma, options);
+    let features = extract(&luma, None, options);
+    assert_eq!(oriented.len(), features.len());
+    let exact = oriented
+        .iter()
+        .map(|(seen, angle_rad)| descriptor::root_sift(isa, &space.place(&seen.blob), *angle_rad).to_vec());
+    let rounded = features.descriptors.as_chunks::<DESCRIPTOR_LEN>().0;
+    let rounded = rounded.iter().map(|d| d.iter().map(|v| f32::from(*v) / 512.0).collect());
+    let both = [exact.collect(), rounded.collect()];
+    (features, both)
+}
+
+/// Pairs that are each other's nearest and clearly nearer than the next.
+fn matches_of(first: &[Vec<f32>], second: &[Vec<f32>]) -> Vec<(u32, u32)> {
+    let two_nearest = |of: &[f32], among: &[Vec<f32>]| {
+        let mut best = [(f32::INFINITY, 0); 2];
+        for (k, other) in among.iter().enumerate() {
+            let squared: f32 = of.iter().zip(other).map(|(a, b)| (a - b) * (a - b)).sum();
+            if squared < best[0].0 {
+                best = [(squared, k), best[0]];
+            } else if squared < best[1].0 {
+                best[1] = (squared, k);
+            }
+        }
+        best
+    };
+    let back: Vec<usize> = second.iter().map(|d| two_nearest(d, first)[0].1).collect();
+    let found = first.iter().enumerate().filter_map(|(k, d)| {
+        let [(nearest, at), (next, _)] = two_nearest(d, second);
+        (nearest < 0.64 * next && back[at] == k).then_some((k as u32, at as u32))
+    });
+    found.collect()
+}
+
+#[test]
+fn eight_bits_cost_less_than_one_match_in_two_hundred() {
+    let options = SiftOptions { max_features: 500, ..options(FirstOctave::Original) };
+    let first = cloth();
+    let (features, descriptors) = rounded_and_not(&first, &options);
+    let (mut exact, mut rounded, mut both) = (0, 0, 0);
+    for name in ["turn 45°", "scale 0.7", "noise 12 greys", "tilt 25°"] {
+        let condition = conditions().into_iter().find(|c| c.name == name).expect("a condition");
+        let second = condition.render(&first, 3);
+        let (other, theirs) = rounded_and_not(&second, &options);
+        let map = condition.second_from_first(first.width, first.height);
+        let size = |picture: &Picture| (picture.width, picture.height);
+        let right = |matches: &[(u32, u32)]| {
+            score((&features, size(&first)), (&other, size(&second)), matches, &map).correct
+        };
+        let [by_exact, by_rounded] = [0, 1].map(|k| matches_of(&descriptors[k], &theirs[k]));
+        exact += right(&by_exact);
+        rounded += right(&by_rounded);
+        let kept: Vec<(u32, u32)> = by_exact.into_iter().filter(|m| by_rounded.contains(m)).collect();
+        both += right(&kept);
+    }
+    assert!(exact > 1000, "{exact}");
+    // Neither fewer in all, nor others.
+    assert!(200 * rounded > 199 * exact && 100 * both > 99 * exact, "{exact} {rounded} {both}");
+    eprintln!("{exact} right matches of numbers, {rounded} of bytes, {both} of both");
+}
