@@ -9,6 +9,7 @@ mod kernels;
 mod memory;
 mod modes;
 mod peer;
+mod repeatability;
 mod retrieval;
 mod sets;
 mod two_views;
@@ -23,6 +24,7 @@ type Section = (&'static str, fn(&Request) -> anyhow::Result<Vec<Row>>);
 const SECTIONS: &[Section] = &[
     ("extraction", extraction::rows),
     ("memory", memory::rows),
+    ("repeatability", repeatability::rows),
     ("kernels", kernels::rows),
     ("two views", two_views::rows),
     ("whole", whole::rows),

@@ -10,8 +10,9 @@ use terrane_benches::{Request, process};
 use crate::sets::Set;
 
 /// Flags beyond those of every run.
-const MODES: [&[&str]; 8] = [
+const MODES: [&[&str]; 9] = [
     &["--features", "sift-upright"],
+    &["--features", "sift-affine"],
     &["--features", "harris"],
     &["--features", "fast"],
     &["--features", "orb"],

@@ -307,7 +307,9 @@ mod tests {
         let refused = refused.unwrap_err();
         assert_eq!(refused.exit_code(), 2);
         let message = refused.to_string();
-        for name in ["bogus", "sift", "sift-upright", "harris", "fast", "orb", "surf", "surf-upright"] {
+        for name in
+            ["bogus", "sift", "sift-upright", "sift-affine", "harris", "fast", "orb", "surf", "surf-upright"]
+        {
             assert!(message.contains(name), "{name} is missing in: {message}");
         }
     }

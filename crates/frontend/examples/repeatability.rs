@@ -1,5 +1,6 @@
 //! Repeatability and matching score under known homographies, side by side with a peer's features of the same pictures:
-//! `repeatability --pictures DIR [--first-octave -1] [--max N] [--peer DIR] PHOTO...`.
+//! `repeatability --pictures DIR [--first-octave -1] [--max N] [--spread S] [--octaves N] [--contrast C] [--affine] [--peer DIR]
+//! PHOTO...`.
 //!
 //! Pictures that are not in `--pictures` yet are rendered into it. `benches/peers/sift_colmap.py` reads them and writes the
 //! folder that `--peer` names.
@@ -147,8 +148,8 @@ fn print(conditions: &[Condition], totals: &[[Total; 2]]) {
         };
         let columns = [
             both(&|t| t.shown, 0),
-            both(&|t| 100.0 * t.repeatability, 1),
-            both(&|t| 100.0 * t.matching_score, 1),
+            both(&|t| 100.0 * t.repeatability, 2),
+            both(&|t| 100.0 * t.matching_score, 2),
             both(&|t| t.correct, 0),
             both(&|t| 100.0 * t.precision, 1),
             both(&|t| t.error_px, 3),

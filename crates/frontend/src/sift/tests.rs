@@ -446,5 +446,4 @@ fn eight_bits_cost_less_than_one_match_in_two_hundred() {
     assert!(exact > 1000, "{exact}");
     // Neither fewer in all, nor others.
     assert!(200 * rounded > 199 * exact && 100 * both > 99 * exact, "{exact} {rounded} {both}");
-    eprintln!("{exact} right matches of numbers, {rounded} of bytes, {both} of both");
 }
