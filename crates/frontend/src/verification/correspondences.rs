@@ -1,15 +1,20 @@
-//! Matches as points: in pixels and on the plane z = 1 of each camera, best first.
+//! Matches as points: in pixels and on the plane z = 1 of each camera, likeliest first.
 
 use nalgebra::{Matrix3, Vector2};
 use terrane_geometry::Camera;
 use terrane_geometry::two_view::squared_sampson_error;
 use terrane_scene::{CameraRecord, FocalSource, ImagePair, Keypoint, MatchedPair, PairSummary};
 
+use super::agreement::agreeing;
 use super::models::Geometry;
 use super::{Candidate, VerificationOptions};
+use crate::matching::Match;
 
-/// The usable matches of a pair, by falling quality.
+/// The usable matches of a pair, by falling quality: those that turn and grow as most do, then the others, both by the
+/// ratio of their distances.
 pub(super) struct Correspondences {
+    /// Whether more of them turn and grow alike than by chance.
+    pub(super) many_agree: bool,
     /// Feature of the first image, feature of the second.
     matches: Vec<[u32; 2]>,
     pub(super) first_px: Vec<Vector2<f64>>,
@@ -40,6 +45,7 @@ impl Correspondences {
         let is_guessed = cameras.map(|record: &CameraRecord| record.focal_source == FocalSource::Guess);
         let threshold_px = options.max_error_px;
         let mut points = Self {
+            many_agree: false,
             matches: Vec::new(),
             first_px: Vec::new(),
             second_px: Vec::new(),
@@ -56,19 +62,28 @@ impl Correspondences {
                 / 2.0,
             cameras: cameras.map(|record| record.camera),
         };
-        let mut order: Vec<_> = candidate.matches.iter().collect();
-        order.sort_by(|a, b| a.ratio.total_cmp(&b.ratio).then((a.first, a.second).cmp(&(b.first, b.second))));
-        for found in order {
-            let ends = [
-                candidate.first.keypoints.get(found.first as usize),
-                candidate.second.keypoints.get(found.second as usize),
-            ];
-            if let [Some(a), Some(b)] = ends {
-                points.push([found.first, found.second], a, b, options.watermark_border);
-            }
+        for (indices, [a, b]) in points.ordered(candidate) {
+            points.push(indices, a, b, options.watermark_border);
         }
         points.drop_static_border();
         points
+    }
+
+    /// Matches of keypoints that exist, likeliest first.
+    fn ordered<'a>(&mut self, candidate: &Candidate<'a>) -> Vec<([u32; 2], [&'a Keypoint; 2])> {
+        let mut order: Vec<_> = candidate.matches.iter().collect();
+        order.sort_by(|a, b| a.ratio.total_cmp(&b.ratio).then((a.first, a.second).cmp(&(b.first, b.second))));
+        let ends = |found: &Match| {
+            let first = candidate.first.keypoints.get(found.first as usize)?;
+            let second = candidate.second.keypoints.get(found.second as usize)?;
+            Some(([found.first, found.second], [first, second]))
+        };
+        let found: Vec<_> = order.into_iter().filter_map(ends).collect();
+        let keypoints: Vec<_> = found.iter().map(|(_, [a, b])| (*a, *b)).collect();
+        let Some(agrees) = agreeing(&keypoints) else { return found };
+        self.many_agree = true;
+        let of = |wanted: bool| found.iter().zip(&agrees).filter(move |(_, agrees)| **agrees == wanted);
+        of(true).chain(of(false)).map(|(found, _)| *found).collect()
     }
 
     fn push(&mut self, indices: [u32; 2], a: &Keypoint, b: &Keypoint, border: f64) {

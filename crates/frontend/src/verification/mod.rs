@@ -4,6 +4,7 @@
 //! a homography and a pure rotation are tried on what agrees. The kind follows from the shares of inliers, as in COLMAP
 //! (Schönberger & Frahm 2016). Matches that stay at one place near the border are a watermark, not a scene.
 
+mod agreement;
 mod correspondences;
 mod guided;
 mod models;
