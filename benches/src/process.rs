@@ -48,11 +48,23 @@ pub fn run(command: &mut Command) -> anyhow::Result<(Usage, String)> {
     Ok((Usage { wall_s, cpu_s }, text))
 }
 
-/// The release binary of terrane, built if need be.
+/// The release binary of terrane as a newcomer builds it, built if need be.
 ///
 /// # Errors
 /// When the build fails.
 pub fn terrane() -> anyhow::Result<PathBuf> {
+    built_with(&[])
+}
+
+/// The release binary of terrane with everything, built if need be. It takes the place of the other one.
+///
+/// # Errors
+/// When the build fails.
+pub fn full_terrane() -> anyhow::Result<PathBuf> {
+    built_with(&["--features", "full"])
+}
+
+fn built_with(flags: &[&str]) -> anyhow::Result<PathBuf> {
     let mut build = Command::new(env!("CARGO"));
     build.args([
         "build",
@@ -63,7 +75,7 @@ pub fn terrane() -> anyhow::Result<PathBuf> {
         "terrane",
         "--message-format=json",
     ]);
-    let (_, text) = run(build.current_dir(crate::root()))?;
+    let (_, text) = run(build.args(flags).current_dir(crate::root()))?;
     text.lines()
         .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
         .filter_map(|message| message["executable"].as_str().map(PathBuf::from))

@@ -15,7 +15,7 @@ pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
         let row = Row::new("COLMAP's mappers on terrane's database", None, "", Bar::None);
         return Ok(vec![row.note("no Python with pycolmap")]);
     };
-    let terrane = process::terrane()?;
+    let terrane = process::full_terrane()?;
     let mut rows = Vec::new();
     for name in ["fountain-P11", "castle-P19"] {
         let set = Set::named(name);

@@ -29,8 +29,8 @@ const SECTIONS: &[Section] = &[
     ("two views", two_views::rows),
     ("whole", whole::rows),
     ("retrieval", retrieval::rows),
-    ("interchange", interchange::rows),
     ("modes", modes::rows),
+    ("interchange", interchange::rows),
 ];
 
 fn main() -> anyhow::Result<()> {
