@@ -26,8 +26,6 @@ const IMAGES: usize = LEVELS + 3;
 pub(super) const BASE_SIGMA: f64 = 1.6;
 /// Columns that a tile has at most, overlaps included: its rings take some 450 bytes a column.
 pub(super) const TILE_COLUMNS: usize = 1024;
-/// Columns by which a tile reaches over its neighbours: the sum of the kernels' radii and what the search looks at.
-const OVERLAP: usize = 44;
 
 /// Of each level that is kept, every how manieth row and column. The blur of the third is more than three pixels of the
 /// octave, so that half of them hold it; with half of the others, some 2 % of the matches across a rotation were lost, for
@@ -169,7 +167,8 @@ pub(super) struct Octave {
 /// Runs an octave in tiles of at most `tile_columns` columns, in parallel where threads are idle.
 pub(super) fn run(isa: Isa, base: Base<'_>, thresholds: &Thresholds, tile_columns: usize) -> Octave {
     let size = base.size();
-    let tiles = tiles(size.width, tile_columns);
+    let blurs = blurs();
+    let tiles = tiles(size.width, tile_columns, overlap(&blurs));
     let mut levels: Vec<Plane> = STEPS.iter().map(|&step| Plane::new(size, step)).collect();
     let mut kept: Vec<Vec<Vec<&mut [u16]>>> = tiles.iter().map(|_| Vec::with_capacity(LEVELS)).collect();
     for level in &mut levels {
@@ -183,7 +182,7 @@ pub(super) fn run(isa: Isa, base: Base<'_>, thresholds: &Thresholds, tile_column
     let found: Vec<Vec<Extremum>> = tiles
         .par_iter()
         .zip(kept)
-        .map(|(tile, mut kept)| Stream::new(isa, size.height, tile).run(base, thresholds, &mut kept))
+        .map(|(tile, mut kept)| Stream::new(isa, size.height, tile, &blurs).run(base, thresholds, &mut kept))
         .collect();
     Octave { levels, extrema: found.concat() }
 }
@@ -196,16 +195,27 @@ struct Tile {
     core: Range<usize>,
 }
 
+/// What makes each image of the one before.
+fn blurs() -> Vec<Taps> {
+    (1..IMAGES).map(|s| Taps::increment(sigma_of_level(s as f64 - 1.0), sigma_of_level(s as f64))).collect()
+}
+
+/// Columns by which a tile reaches over its neighbours: the sum of the kernels' radii and what the search looks at. Even,
+/// as tiles start at even columns.
+fn overlap(blurs: &[Taps]) -> usize {
+    (blurs.iter().map(Taps::radius).sum::<usize>() + Detector::REACH).next_multiple_of(2)
+}
+
 /// Cuts a width into tiles whose cores follow one another.
-fn tiles(width: usize, tile_columns: usize) -> Vec<Tile> {
-    let core = tile_columns.saturating_sub(2 * OVERLAP).max(2 * BLOCK);
-    let count = if width <= core + OVERLAP { 1 } else { width.div_ceil(core) };
+fn tiles(width: usize, tile_columns: usize, overlap: usize) -> Vec<Tile> {
+    let core = tile_columns.saturating_sub(2 * overlap).max(2 * BLOCK);
+    let count = if width <= core + overlap { 1 } else { width.div_ceil(core) };
     let core = width.div_ceil(count).next_multiple_of(2);
     (0..count)
         .map(|k| (k * core).min(width)..((k + 1) * core).min(width))
         .filter(|core| !core.is_empty())
         .map(|core| Tile {
-            columns: core.start.saturating_sub(OVERLAP)..(core.end + OVERLAP).min(width),
+            columns: core.start.saturating_sub(overlap)..(core.end + overlap).min(width),
             core,
         })
         .collect()
@@ -216,7 +226,7 @@ struct Stream<'a> {
     isa: Isa,
     height: usize,
     tile: &'a Tile,
-    blurs: Vec<Taps>,
+    blurs: &'a [Taps],
     /// By how many rows each image trails the first.
     delays: [usize; IMAGES],
     images: Vec<RowRing<i16>>,
@@ -225,16 +235,12 @@ struct Stream<'a> {
 }
 
 impl<'a> Stream<'a> {
-    fn new(isa: Isa, height: usize, tile: &'a Tile) -> Self {
-        let blurs: Vec<Taps> = (1..IMAGES)
-            .map(|s| Taps::increment(sigma_of_level(s as f64 - 1.0), sigma_of_level(s as f64)))
-            .collect();
+    fn new(isa: Isa, height: usize, tile: &'a Tile, blurs: &'a [Taps]) -> Self {
         let mut delays = [0; IMAGES];
         for s in 1..IMAGES {
             delays[s] = delays[s - 1] + blurs[s - 1].radius();
         }
         let last = delays[IMAGES - 1];
-        debug_assert!(last + Detector::REACH <= OVERLAP);
         let width = tile.columns.len();
         let images = (0..IMAGES)
             .map(|s| RowRing::new(width, blurs.get(s).map_or(1, |blur| 2 * blur.radius() + 1)))
@@ -308,7 +314,7 @@ mod tests {
     fn cores_follow_one_another_and_start_at_even_columns() {
         for width in [1, 2, 63, 175, 176, 177, 500, 928, 1024, 1025, 4001, 6144] {
             for tile_columns in [1, 256, 1024] {
-                let tiles = tiles(width, tile_columns);
+                let tiles = tiles(width, tile_columns, overlap(&blurs()));
                 assert_eq!((tiles[0].core.start, tiles[tiles.len() - 1].core.end), (0, width));
                 assert!(tiles.windows(2).all(|pair| pair[0].core.end == pair[1].core.start));
                 assert!(tiles.iter().all(|tile| tile.core.start % 2 == 0));
