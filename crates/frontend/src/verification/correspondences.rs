@@ -44,8 +44,9 @@ impl Correspondences {
         let cameras = [candidate.first.camera, candidate.second.camera];
         let is_guessed = cameras.map(|record: &CameraRecord| record.focal_source == FocalSource::Guess);
         let threshold_px = options.max_error_px;
+        let (likeliest_first, many_agree) = likeliest_first(candidate);
         let mut points = Self {
-            many_agree: false,
+            many_agree,
             matches: Vec::new(),
             first_px: Vec::new(),
             second_px: Vec::new(),
@@ -62,28 +63,11 @@ impl Correspondences {
                 / 2.0,
             cameras: cameras.map(|record| record.camera),
         };
-        for (indices, [a, b]) in points.ordered(candidate) {
+        for (indices, [a, b]) in likeliest_first {
             points.push(indices, a, b, options.watermark_border);
         }
         points.drop_static_border();
         points
-    }
-
-    /// Matches of keypoints that exist, likeliest first.
-    fn ordered<'a>(&mut self, candidate: &Candidate<'a>) -> Vec<([u32; 2], [&'a Keypoint; 2])> {
-        let mut order: Vec<_> = candidate.matches.iter().collect();
-        order.sort_by(|a, b| a.ratio.total_cmp(&b.ratio).then((a.first, a.second).cmp(&(b.first, b.second))));
-        let ends = |found: &Match| {
-            let first = candidate.first.keypoints.get(found.first as usize)?;
-            let second = candidate.second.keypoints.get(found.second as usize)?;
-            Some(([found.first, found.second], [first, second]))
-        };
-        let found: Vec<_> = order.into_iter().filter_map(ends).collect();
-        let keypoints: Vec<_> = found.iter().map(|(_, [a, b])| (*a, *b)).collect();
-        let Some(agrees) = agreeing(&keypoints) else { return found };
-        self.many_agree = true;
-        let of = |wanted: bool| found.iter().zip(&agrees).filter(move |(_, agrees)| **agrees == wanted);
-        of(true).chain(of(false)).map(|(found, _)| *found).collect()
     }
 
     fn push(&mut self, indices: [u32; 2], a: &Keypoint, b: &Keypoint, border: f64) {
@@ -191,6 +175,22 @@ impl Correspondences {
         };
         MatchedPair { summary, matches }
     }
+}
+
+/// Matches of keypoints that exist, likeliest first, and whether more of them turn and grow alike than by chance.
+fn likeliest_first<'a>(candidate: &Candidate<'a>) -> (Vec<([u32; 2], [&'a Keypoint; 2])>, bool) {
+    let mut order: Vec<_> = candidate.matches.iter().collect();
+    order.sort_by(|a, b| a.ratio.total_cmp(&b.ratio).then((a.first, a.second).cmp(&(b.first, b.second))));
+    let ends = |found: &Match| {
+        let first = candidate.first.keypoints.get(found.first as usize)?;
+        let second = candidate.second.keypoints.get(found.second as usize)?;
+        Some(([found.first, found.second], [first, second]))
+    };
+    let found: Vec<_> = order.into_iter().filter_map(ends).collect();
+    let keypoints: Vec<_> = found.iter().map(|(_, [a, b])| (*a, *b)).collect();
+    let Some(agrees) = agreeing(&keypoints) else { return (found, false) };
+    let of = |wanted: bool| found.iter().zip(&agrees).filter(move |(_, agrees)| **agrees == wanted);
+    (of(true).chain(of(false)).map(|(found, _)| *found).collect(), true)
 }
 
 /// The matrix that takes points of the plane z = 1 to pixels, without distortion.
