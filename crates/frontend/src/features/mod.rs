@@ -132,11 +132,20 @@ impl FeatureOptions {
         }
     }
 
+    /// SIFT's options, and what the method's name says of them.
+    fn named_sift(&self) -> SiftOptions {
+        let mut options = self.sift.clone();
+        options.upright |= self.method == FeatureMethod::SiftUpright;
+        options.affine |= self.method == FeatureMethod::SiftAffine;
+        options
+    }
+
     /// The most features of a photograph.
     pub fn most_features(&self) -> usize {
         match self.method {
-            FeatureMethod::Sift | FeatureMethod::SiftAffine => self.sift.most_features(),
-            FeatureMethod::SiftUpright => self.sift.max_features as usize,
+            FeatureMethod::Sift | FeatureMethod::SiftUpright | FeatureMethod::SiftAffine => {
+                self.named_sift().most_features()
+            }
             FeatureMethod::Harris | FeatureMethod::Fast | FeatureMethod::Orb => {
                 self.corners.max_features as usize
             }
@@ -179,14 +188,8 @@ pub fn extract_masked(
         corners::extract_masked((luma, rgb), mask, (detector, descriptor), &options.corners)
     };
     match options.method {
-        FeatureMethod::Sift => sift::extract_masked(luma, rgb, mask, &options.sift),
-        FeatureMethod::SiftUpright => {
-            let options = SiftOptions { upright: true, ..options.sift.clone() };
-            sift::extract_masked(luma, rgb, mask, &options)
-        }
-        FeatureMethod::SiftAffine => {
-            let options = SiftOptions { affine: true, ..options.sift.clone() };
-            sift::extract_masked(luma, rgb, mask, &options)
+        FeatureMethod::Sift | FeatureMethod::SiftUpright | FeatureMethod::SiftAffine => {
+            sift::extract_masked(luma, rgb, mask, &options.named_sift())
         }
         FeatureMethod::Harris => corners(CornerDetector::Harris, CornerDescriptor::Gradients),
         FeatureMethod::Fast => corners(CornerDetector::Fast, CornerDescriptor::Gradients),

@@ -107,8 +107,10 @@ impl Seen {
 
 /// Blobs with their shapes, or round ones where none are asked for.
 fn seen(space: &ScaleSpace, blobs: Vec<Blob>, options: &SiftOptions) -> Vec<Seen> {
-    let shape = |blob: &Blob| if options.affine { Shape::of(&space.place(blob)) } else { Shape::ROUND };
-    let shapes = by_place(&blobs, |blob| blob, shape);
+    let shapes = match options.affine {
+        true => by_place(&blobs, |blob| blob, |blob| Shape::of(&space.place(blob))),
+        false => vec![Shape::ROUND; blobs.len()],
+    };
     blobs.into_iter().zip(shapes).map(|(blob, shape)| Seen { blob, shape }).collect()
 }
 
