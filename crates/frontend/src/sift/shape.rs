@@ -175,7 +175,7 @@ impl Patch {
         let from_middle = |k: usize| (k as f32 - self.reach as f32) * step;
         let Place { plane, x, y, .. } = place;
         let (width, height) = (plane.size.width, plane.size.height);
-        // The last pixel that has one after it; sides have a dozen pixels at least.
+        // The last pixel that has one after it; sides have half a dozen pixels at least.
         let (last_x, last_y) = ((width - 2) as f32, (height - 2) as f32);
         for (row, values) in self.plane.data[..side * side].chunks_exact_mut(side).enumerate() {
             for (column, value) in values.iter_mut().enumerate() {
@@ -277,7 +277,11 @@ mod tests {
         let plane = blob(5.0, 2.5, 0.4);
         for (x, y) in [(0.0, 0.0), (80.0, 80.0), (-3.0, 90.0), (40.0, 80.9)] {
             let place = Place { plane: &plane, x, y, sigma: 4.0 };
-            let _ = Patch::around(&place, &Shape::of(&place));
+            let shape = Shape::of(&place);
+            assert!((shape.determinant() - 1.0).abs() < 1e-3);
+            let patch = Patch::around(&place, &shape);
+            let samples = &patch.plane.data[..(2 * PATCH_REACH + 1) * (2 * PATCH_REACH + 1)];
+            assert!(samples.iter().all(|value| (2000..=42_000).contains(value)), "({x}, {y})");
         }
     }
 }

@@ -352,29 +352,43 @@ fn cloth() -> Picture {
     Picture { width, height, pixels: scene.data }
 }
 
+fn condition(name: &str) -> Condition {
+    conditions().into_iter().find(|condition| condition.name == name).expect("a condition")
+}
+
+fn luma(picture: &Picture) -> GrayImage {
+    GrayImage { width: picture.width, height: picture.height, data: picture.pixels.clone() }
+}
+
+/// How many of some matches of `first` and what a condition makes of it are right.
+fn num_right(
+    condition: &Condition,
+    (first, features): (&Picture, &Features),
+    (second, others): (&Picture, &Features),
+    matches: &[(u32, u32)],
+) -> usize {
+    let map = condition.second_from_first(first.width, first.height);
+    let size = |picture: &Picture| (picture.width, picture.height);
+    score((features, size(first)), (others, size(second)), matches, &map).correct
+}
+
 /// Right matches of a picture and what a condition makes of it.
 fn right_matches(condition: &Condition, options: &SiftOptions) -> usize {
     let first = cloth();
     let second = condition.render(&first, 5);
-    let features = [&first, &second].map(|picture| {
-        let Picture { width, height, ref pixels } = *picture;
-        extract(&GrayImage { width, height, data: pixels.clone() }, None, options)
-    });
+    let features = [&first, &second].map(|picture| extract(&luma(picture), None, options));
     let matches: Vec<(u32, u32)> = match_features(&features[0], &features[1], &MatchOptions::default())
         .iter()
         .map(|m| (m.first, m.second))
         .collect();
-    let map = condition.second_from_first(first.width, first.height);
-    let size = |picture: &Picture| (picture.width, picture.height);
-    score((&features[0], size(&first)), (&features[1], size(&second)), &matches, &map).correct
+    num_right(condition, (&first, &features[0]), (&second, &features[1]), &matches)
 }
 
 #[test]
 fn affine_shapes_keep_matches_of_a_plane_far_aslant_and_most_of_one_seen_from_the_front() {
     let round = options(FirstOctave::Original);
     let affine = SiftOptions { affine: true, ..round.clone() };
-    let of = |name: &str| conditions().into_iter().find(|c| c.name == name).expect("a condition");
-    let (aslant, front) = (of("tilt 55°"), of("turn 45°"));
+    let (aslant, front) = (condition("tilt 55°"), condition("turn 45°"));
     let (with, without) = (right_matches(&aslant, &affine), right_matches(&aslant, &round));
     assert!(10 * with > 11 * without, "{with} {without}");
     let (with, without) = (right_matches(&front, &affine), right_matches(&front, &round));
@@ -383,8 +397,7 @@ fn affine_shapes_keep_matches_of_a_plane_far_aslant_and_most_of_one_seen_from_th
 
 /// Descriptors before and after rounding, with their keypoints.
 fn rounded_and_not(picture: &Picture, options: &SiftOptions) -> (Features, [Vec<Vec<f32>>; 2]) {
-    let Picture { width, height, ref pixels } = *picture;
-    let luma = GrayImage { width, height, data: pixels.clone() };
+    let luma = luma(picture);
     let isa = Isa::detect();
     let space = ScaleSpace::new(Paths { isa, tile_columns: TILE_COLUMNS }, &luma, options);
     let seen = seen(&space, strongest(&space, &luma, None, options), options);
@@ -429,14 +442,11 @@ fn eight_bits_cost_less_than_one_match_in_two_hundred() {
     let (features, descriptors) = rounded_and_not(&first, &options);
     let (mut exact, mut rounded, mut both) = (0, 0, 0);
     for name in ["turn 45°", "scale 0.7", "noise 12 greys", "tilt 25°"] {
-        let condition = conditions().into_iter().find(|c| c.name == name).expect("a condition");
+        let condition = condition(name);
         let second = condition.render(&first, 3);
         let (other, theirs) = rounded_and_not(&second, &options);
-        let map = condition.second_from_first(first.width, first.height);
-        let size = |picture: &Picture| (picture.width, picture.height);
-        let right = |matches: &[(u32, u32)]| {
-            score((&features, size(&first)), (&other, size(&second)), matches, &map).correct
-        };
+        let right =
+            |matches: &[(u32, u32)]| num_right(&condition, (&first, &features), (&second, &other), matches);
         let [by_exact, by_rounded] = [0, 1].map(|k| matches_of(&descriptors[k], &theirs[k]));
         exact += right(&by_exact);
         rounded += right(&by_rounded);
