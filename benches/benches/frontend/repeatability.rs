@@ -15,6 +15,10 @@ use crate::sets::{SETS, Set};
 const PER_SET: usize = 1;
 
 pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
+    let Some(python) = process::python() else {
+        let row = Row::new("repeatability", None, "", Bar::None);
+        return Ok(vec![row.note("no Python with pycolmap")]);
+    };
     let sets = SETS.iter().filter(|set| set.quick || !request.quick);
     let photographs: Vec<PathBuf> =
         sets.map(chosen).collect::<anyhow::Result<Vec<_>>>()?.into_iter().flatten().collect();
@@ -23,12 +27,8 @@ pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
     example(&["--pictures".as_ref(), &pictures], &photographs)?;
     let mut rows = Vec::new();
     for octave in ["0", "-1"] {
-        let Some(python) = process::python() else {
-            rows.push(Row::new("repeatability", None, "", Bar::None).note("COLMAP did not run"));
-            break;
-        };
         let theirs = folder.path().join(format!("peer{octave}"));
-        let mut peer = Command::new(python);
+        let mut peer = Command::new(&python);
         peer.arg(root().join("benches/peers/sift_colmap.py")).arg(&pictures).arg(&theirs);
         process::run(peer.args(["--first-octave", octave, "--threads", "2"]))?;
         let flags: [&Path; 8] = [
