@@ -293,7 +293,7 @@ pub(super) fn linearise(
     0.5 * rho
 }
 
-/// Cholesky of `V + λD`, and the largest squared gradient relative to its diagonal. A singular point is held: all zeros.
+/// The normal equations of a point and their Cholesky factor; see [`factorize_normal`].
 fn factorize_point(terms: &[Terms], damping: f64) -> (PointTerms, f64) {
     let mut v = [0.0; 6];
     let mut gradient = [0.0; 3];
@@ -311,6 +311,13 @@ fn factorize_point(terms: &[Terms], damping: f64) -> (PointTerms, f64) {
             }
         }
     }
+    factorize_normal(&v, &gradient, damping)
+}
+
+/// Cholesky of `V + λD` (lower triangle by rows), and the largest squared gradient relative to its diagonal. A singular
+/// point is held: all zeros.
+#[inline(always)]
+pub(super) fn factorize_normal(v: &[f64; 6], gradient: &[f64; 3], damping: f64) -> (PointTerms, f64) {
     let diagonal = [v[0], v[2], v[5]];
     let l00 = (v[0] * (1.0 + damping)).sqrt();
     let l10 = v[1] / l00;

@@ -7,7 +7,10 @@
 //! Observations whose point starts behind the camera take no part in the solve. A step that would carry a point behind
 //! a camera is shortened for this point; if that does not help it counts as no descent.
 
+mod explicit;
+mod implicit;
 mod layout;
+mod levenberg_marquardt;
 mod linearisation;
 mod options;
 mod pattern;
@@ -20,7 +23,7 @@ mod shards;
 mod solver;
 mod step;
 
-pub use options::{BundleOptions, Gauge};
+pub use options::{BundleOptions, BundleSolver, Gauge, Precision, Preconditioner};
 pub use problem::{BundleProblem, FocalPrior, PositionPrior, RefineIntrinsics};
 pub use report::{BundleReport, Termination};
 pub use shards::{BundleObservation, BundleShard, InMemoryShards, ShardError, Shards};

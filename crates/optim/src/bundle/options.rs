@@ -20,6 +20,49 @@ pub enum Gauge {
     TwoPoses,
 }
 
+/// How the linear systems of an adjustment are solved.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BundleSolver {
+    /// By the number of unknowns.
+    #[default]
+    Auto,
+    /// The reduced camera system is formed and factorised.
+    Explicit,
+    /// The reduced camera system is only multiplied with: preconditioned conjugate gradients (Hestenes & Stiefel 1952;
+    /// Agarwal et al. 2010).
+    Implicit,
+}
+
+/// What speeds up conjugate gradients.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Preconditioner {
+    /// Two-level.
+    #[default]
+    Auto,
+    /// The diagonal blocks of the reduced system: one a camera.
+    BlockJacobi,
+    /// One block for each cluster of cameras.
+    ClusterBlocks,
+    /// The inverse of the cameras' normal equations, corrected by a truncated power series (Weber et al. 2023). Needs
+    /// intrinsics that no two poses share, or that are held.
+    PowerSeries,
+    /// Cluster blocks, and a coarse system of one similarity for each cluster.
+    TwoLevel,
+}
+
+/// What the kernels of conjugate gradients compute in. Costs and gradients are always `f64`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Precision {
+    /// Jacobians in `f32`; sums over cameras in `f64`.
+    #[default]
+    Single,
+    /// `f64` throughout.
+    Double,
+}
+
 /// Options of [`super::solve`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -45,7 +88,18 @@ pub struct BundleOptions {
     pub initial_damping: f64,
     /// What fixes the free directions. Default: damped.
     pub gauge: Gauge,
-    /// How the reduced camera system is solved. Default: by size and fill.
+    /// How steps are solved for. Default: by the number of unknowns.
+    pub solver: BundleSolver,
+    /// The preconditioner of the implicit solver. Default: two-level.
+    pub preconditioner: Preconditioner,
+    /// What the implicit solver computes products in. Default: `f32` with `f64` sums.
+    pub precision: Precision,
+    /// Conjugate gradients stop when the residual, in the preconditioner's norm, is below this part of the first.
+    /// Range: above 0 to below 1. Default 0.1 (Ceres).
+    pub linear_tolerance: f64,
+    /// Most iterations of conjugate gradients for a step. Default 500.
+    pub max_linear_iterations: u32,
+    /// How the explicit reduced camera system is factorised. Default: by size and fill.
     pub linear_solver: LinearSolver,
     /// Memory for shards' linearisations that are kept between passes, in bytes; shards beyond it are linearised again
     /// in each pass, with the same result. Default 1 GiB.
@@ -65,6 +119,11 @@ impl Default for BundleOptions {
             step_tolerance: 1e-10,
             initial_damping: 1e-4,
             gauge: Gauge::Damped,
+            solver: BundleSolver::Auto,
+            preconditioner: Preconditioner::Auto,
+            precision: Precision::Single,
+            linear_tolerance: 0.1,
+            max_linear_iterations: 500,
             linear_solver: LinearSolver::Auto,
             linearisation_memory_bytes: 1 << 30,
         }
@@ -78,6 +137,7 @@ impl BundleOptions {
             ("loss_scale_px", self.loss_scale_px),
             ("prior_loss_scale_sigma", self.prior_loss_scale_sigma),
             ("initial_damping", self.initial_damping),
+            ("linear_tolerance", self.linear_tolerance),
         ];
         for (name, value) in positive {
             if !(value.is_finite() && value > 0.0) {
@@ -88,6 +148,7 @@ impl BundleOptions {
             ("cost_tolerance", self.cost_tolerance),
             ("gradient_tolerance", self.gradient_tolerance),
             ("step_tolerance", self.step_tolerance),
+            ("linear_tolerance", self.linear_tolerance),
         ];
         for (name, value) in tolerances {
             if !(0.0..1.0).contains(&value) {

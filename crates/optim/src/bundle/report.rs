@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::BundleSolver;
+
 /// Why a solve stopped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -34,6 +36,10 @@ pub struct BundleReport {
     pub initial_cost: f64,
     /// Cost after.
     pub final_cost: f64,
+    /// What solved for the steps.
+    pub solver: BundleSolver,
+    /// Iterations of conjugate gradients, all steps together; none where the system was factorised.
+    pub linear_iterations: u64,
     /// Linear solves, accepted or not.
     pub iterations: u32,
     /// Steps that lowered the cost.
@@ -59,6 +65,8 @@ impl BundleReport {
         Self {
             initial_cost: 0.0,
             final_cost: 0.0,
+            solver: BundleSolver::Auto,
+            linear_iterations: 0,
             iterations: 0,
             accepted_steps: 0,
             termination: Termination::NothingToAdjust,

@@ -23,6 +23,29 @@ pub(super) struct Tried {
     pub norm_squared: f64,
 }
 
+impl Tried {
+    /// The won part of what the model promised; not above zero when the step is no descent.
+    pub fn gain(&self, cost: f64) -> f64 {
+        let gain = (cost - self.cost) / self.model_reduction;
+        if gain.is_finite() && self.model_reduction > 0.0 { gain } else { -1.0 }
+    }
+
+    /// Whether the step is no longer than this part of the parameters' norm.
+    pub fn is_short(&self, tolerance: f64) -> bool {
+        self.step_squared.sqrt() <= tolerance * (self.norm_squared.sqrt() + tolerance)
+    }
+
+    /// The sum of two parts.
+    pub fn plus(self, part: &Self) -> Self {
+        Self {
+            cost: self.cost + part.cost,
+            model_reduction: self.model_reduction + part.model_reduction,
+            step_squared: self.step_squared + part.step_squared,
+            norm_squared: self.norm_squared + part.norm_squared,
+        }
+    }
+}
+
 /// The step of the cameras, and where it leads.
 pub(super) struct CameraStep<'a> {
     pub step: &'a [f64],
@@ -70,12 +93,7 @@ pub(super) fn try_step(
             sum
         })
         .collect();
-    parts.iter().fold(Tried::default(), |sum, part| Tried {
-        cost: sum.cost + part.cost,
-        model_reduction: sum.model_reduction + part.model_reduction,
-        step_squared: sum.step_squared + part.step_squared,
-        norm_squared: sum.norm_squared + part.norm_squared,
-    })
+    parts.iter().fold(Tried::default(), Tried::plus)
 }
 
 /// Back-substitution: `δp = −L⁻ᵀ (L⁻¹ g + Σ Zᵀ δc)`.

@@ -1,0 +1,260 @@
+//! The block of one cluster of cameras: built from its part's points, factorised, solved with.
+
+use faer::dyn_stack::{MemBuffer, MemStack};
+use faer::linalg::cholesky::llt;
+use faer::{MatMut, Par};
+
+use super::super::layout::NONE;
+use super::blocks::widest;
+use super::part::CameraMap;
+use super::real::{LANES, Real, by_stride};
+use super::state::{Frame, PartState, packed};
+
+/// One camera of a cluster.
+#[derive(Clone, Copy)]
+struct Owned {
+    pose: u32,
+    /// Its place among the part's cameras, or [`NONE`] when it sees none of the part's points.
+    camera: u32,
+    /// First row of its block.
+    offset: u32,
+    /// Rows of the pose, none when it is held.
+    pose_rows: u32,
+    /// Rows of its own intrinsics.
+    intrinsics_rows: u32,
+}
+
+impl Owned {
+    /// For each row of its block, the unknown among the `6 + stride` of a camera.
+    fn rows(&self) -> impl Iterator<Item = usize> + use<> {
+        let (pose, intrinsics) = (self.pose_rows as usize, self.intrinsics_rows as usize);
+        (0..pose).chain(6..6 + intrinsics)
+    }
+
+    fn num_rows(&self) -> usize {
+        (self.pose_rows + self.intrinsics_rows) as usize
+    }
+}
+
+/// The Cholesky factor of a cluster's block.
+///
+/// The block holds the diagonal of the whole reduced system, and beside it what the part's own points say of each two
+/// cameras of the cluster: no larger than the truth, and so positive definite.
+pub(super) struct LocalFactor<T> {
+    owned: Vec<Owned>,
+    /// Columns of the lower triangle, one after another.
+    columns: Vec<T>,
+    /// The inverse of the diagonal.
+    inverse: Vec<T>,
+    work: Vec<T>,
+}
+
+impl<T: Real> LocalFactor<T> {
+    /// Solves for the cluster's cameras: reads `right`, the vector of all unknowns, and returns the local solution.
+    pub fn solve(&mut self, map: &CameraMap, right: &[f64]) -> Vec<f64> {
+        let Self { owned, columns, inverse, work } = self;
+        work.clear();
+        for index in indices(owned, map) {
+            work.push(T::from_f64(right[index]));
+        }
+        widest(|| substitute(columns, inverse, work));
+        work.iter().map(|v| v.to_f64()).collect()
+    }
+}
+
+fn indices<'a>(owned: &'a [Owned], map: &'a CameraMap) -> impl Iterator<Item = usize> + 'a {
+    owned.iter().flat_map(|camera| {
+        let unknowns = &map.of_pose[camera.pose as usize];
+        camera.rows().map(move |row| match row {
+            0..6 => unknowns.pose as usize + row,
+            _ => unknowns.intrinsics as usize + row - 6,
+        })
+    })
+}
+
+/// For each row of a cluster's block its unknown.
+pub(super) fn cluster_indices(map: &CameraMap, members: &[u32]) -> Vec<u32> {
+    indices(&owned_cameras(map, members, &[]), map).map(|index| index as u32).collect()
+}
+
+/// The free cameras of a cluster, ascending.
+fn owned_cameras(map: &CameraMap, members: &[u32], poses: &[u32]) -> Vec<Owned> {
+    let mut owned = Vec::new();
+    let mut offset = 0;
+    for pose in members.iter().copied() {
+        let unknowns = &map.of_pose[pose as usize];
+        let camera = Owned {
+            pose,
+            camera: poses.binary_search(&pose).map_or(NONE, |at| at as u32),
+            offset,
+            pose_rows: if unknowns.pose == NONE { 0 } else { 6 },
+            intrinsics_rows: if unknowns.own { unknowns.num_intrinsics } else { 0 },
+        };
+        if camera.num_rows() > 0 {
+            offset += camera.num_rows() as u32;
+            owned.push(camera);
+        }
+    }
+    owned
+}
+
+impl<T: Real> PartState<T> {
+    /// Builds and factorises the block of cluster `cluster`; `diagonal` holds the packed diagonal block of every pose.
+    pub fn factorize_local(&mut self, frame: &Frame<'_>, cluster: usize, diagonal: &[f64]) {
+        let owned = owned_cameras(frame.map, &frame.clusters.members[cluster], &self.part.poses);
+        let n = owned.last().map_or(0, |last| last.offset as usize + last.num_rows());
+        let mut matrix = vec![0.0; n * n];
+        add_diagonal(&mut matrix, n, &owned, frame.map.width(), diagonal);
+        self.subtract_pairs(&mut matrix, n, &owned, frame.map.stride);
+        let mut held = factorize(&mut matrix, n);
+        if !held {
+            // Rounding has the last word only where the cluster hardly holds together: its cameras one by one then.
+            matrix.fill(0.0);
+            add_diagonal(&mut matrix, n, &owned, frame.map.width(), diagonal);
+            held = factorize(&mut matrix, n);
+        }
+        let mut factor = self.local.take().unwrap_or_else(|| LocalFactor {
+            owned: Vec::new(),
+            columns: Vec::new(),
+            inverse: Vec::new(),
+            work: Vec::new(),
+        });
+        factor.owned = owned;
+        factor.columns.clear();
+        factor.inverse.clear();
+        for column in 0..n {
+            let values = &matrix[n * column..n * (column + 1)];
+            if held {
+                factor.inverse.push(T::from_f64(1.0 / values[column]));
+                factor.columns.extend(values[column + 1..].iter().map(|v| T::from_f64(*v)));
+            } else {
+                factor.inverse.push(T::from_f64(1.0));
+                factor.columns.extend(std::iter::repeat_n(T::default(), n - column - 1));
+            }
+        }
+        self.local = Some(factor);
+    }
+
+    /// Takes `Z_i Z_jᵀ` of each two of the cluster's cameras that see one of the part's points.
+    fn subtract_pairs(&self, matrix: &mut [f64], n: usize, owned: &[Owned], stride: usize) {
+        let width = 6 + stride;
+        let (mut seen, mut values) = (Vec::new(), Vec::new());
+        for (at, camera) in owned.iter().enumerate().filter(|(_, camera)| camera.camera != NONE) {
+            let index = camera.camera as usize;
+            for group in self.lanes.first_group[index] as usize..self.lanes.first_group[index + 1] as usize {
+                let z = by_stride!(stride, K => widest(|| self.lanes.group_z::<K>(index, group)));
+                for (l, point) in self.lanes.points[group].iter().enumerate() {
+                    if *point < self.part.first_fixed_point {
+                        seen.push((*point, at as u32));
+                        for row in camera.rows() {
+                            debug_assert!(row < width);
+                            values.extend((0..3).map(|c| z[row][c][l].to_f64()));
+                        }
+                        // Every item takes as much room.
+                        values.resize(3 * width * seen.len(), 0.0);
+                    }
+                }
+            }
+        }
+        let mut order: Vec<u32> = (0..seen.len() as u32).collect();
+        order.sort_by_key(|i| seen[*i as usize]);
+        for run in order.chunk_by(|a, b| seen[*a as usize].0 == seen[*b as usize].0) {
+            for (at, first) in run.iter().enumerate() {
+                let a = &owned[seen[*first as usize].1 as usize];
+                let za = &values[3 * width * *first as usize..][..3 * a.num_rows()];
+                for second in &run[at + 1..] {
+                    let b = &owned[seen[*second as usize].1 as usize];
+                    if a.offset != b.offset {
+                        let zb = &values[3 * width * *second as usize..][..3 * b.num_rows()];
+                        widest(|| subtract_block(matrix, n, (b.offset as usize, zb), (a.offset as usize, za)));
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// `matrix[rows, columns] −= Z_rows Z_columnsᵀ`, column-major.
+#[inline(always)]
+fn subtract_block(
+    matrix: &mut [f64],
+    n: usize,
+    (row, z_rows): (usize, &[f64]),
+    (column, z_columns): (usize, &[f64]),
+) {
+    for (c, zc) in z_columns.as_chunks::<3>().0.iter().enumerate() {
+        let start = n * (column + c) + row;
+        let target = &mut matrix[start..start + z_rows.len() / 3];
+        for (value, zr) in target.iter_mut().zip(z_rows.as_chunks::<3>().0) {
+            *value -= zr[0] * zc[0] + zr[1] * zc[1] + zr[2] * zc[2];
+        }
+    }
+}
+
+fn add_diagonal(matrix: &mut [f64], n: usize, owned: &[Owned], width: usize, diagonal: &[f64]) {
+    for camera in owned {
+        let block = &diagonal[packed(width) * camera.pose as usize..packed(width) * (camera.pose as usize + 1)];
+        for (i, a) in camera.rows().enumerate() {
+            for (j, b) in camera.rows().enumerate().take(i + 1) {
+                matrix[n * (camera.offset as usize + j) + camera.offset as usize + i] = block[packed(a) + b];
+            }
+        }
+    }
+}
+
+/// Cholesky in place, in the lower triangle; whether the matrix was positive definite.
+fn factorize(matrix: &mut [f64], n: usize) -> bool {
+    if n == 0 {
+        return true;
+    }
+    if !matrix.iter().all(|v| v.is_finite()) {
+        return false;
+    }
+    let mut memory =
+        MemBuffer::new(llt::factor::cholesky_in_place_scratch::<f64>(n, Par::Seq, Default::default()));
+    let stack = MemStack::new(&mut memory);
+    let matrix = MatMut::from_column_major_slice_mut(matrix, n, n);
+    llt::factor::cholesky_in_place(matrix, Default::default(), Par::Seq, stack, Default::default()).is_ok()
+}
+
+/// `x = L⁻ᵀ L⁻¹ x`.
+#[inline(always)]
+fn substitute<T: Real>(columns: &[T], inverse: &[T], x: &mut [T]) {
+    let n = inverse.len();
+    let mut rest = columns;
+    for column in 0..n {
+        let (values, after) = rest.split_at(n - column - 1);
+        rest = after;
+        let value = x[column] * inverse[column];
+        x[column] = value;
+        let negative = T::default() - value;
+        for (x, factor) in x[column + 1..].iter_mut().zip(values) {
+            *x = factor.mul_add(negative, *x);
+        }
+    }
+    let mut rest = columns;
+    for column in (0..n).rev() {
+        let (before, values) = rest.split_at(rest.len() - (n - column - 1));
+        rest = before;
+        let value = dot(values, &x[column + 1..]);
+        x[column] = (x[column] - value) * inverse[column];
+    }
+}
+
+/// Dot product by lanes, always in the same order.
+#[inline(always)]
+fn dot<T: Real>(a: &[T], b: &[T]) -> T {
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+    let mut sums = [T::default(); LANES];
+    for (a, b) in a.iter().zip(b) {
+        sums = std::array::from_fn(|l| a[l].mul_add(b[l], sums[l]));
+    }
+    let mut total = T::default();
+    for value in sums {
+        total += value;
+    }
+    for (a, b) in a_rest.iter().zip(b_rest) {
+        total = a.mul_add(*b, total);
+    }
+    total
+}

@@ -1,0 +1,105 @@
+//! The numbers that kernels compute in: `f32` or `f64`, eight at a time.
+
+use std::ops::{Add, AddAssign, Mul, Sub};
+
+/// Observations that are worked on together.
+pub(super) const LANES: usize = 8;
+
+/// One number for each lane.
+pub(super) type Lanes<T> = [T; LANES];
+
+/// `f32` or `f64`.
+pub(super) trait Real:
+    Copy
+    + Default
+    + Send
+    + Sync
+    + PartialEq
+    + Add<Output = Self>
+    + Sub<Output = Self>
+    + Mul<Output = Self>
+    + AddAssign
+    + 'static
+{
+    /// Rounded to this type.
+    fn from_f64(value: f64) -> Self;
+    /// Widened.
+    fn to_f64(self) -> f64;
+    /// `self · a + b`, rounded once, on every processor.
+    fn mul_add(self, a: Self, b: Self) -> Self;
+}
+
+macro_rules! real {
+    ($t:ty) => {
+        impl Real for $t {
+            #[inline(always)]
+            fn from_f64(value: f64) -> Self {
+                value as $t
+            }
+
+            #[inline(always)]
+            fn to_f64(self) -> f64 {
+                f64::from(self)
+            }
+
+            #[inline(always)]
+            fn mul_add(self, a: Self, b: Self) -> Self {
+                <$t>::mul_add(self, a, b)
+            }
+        }
+    };
+}
+
+real!(f32);
+real!(f64);
+
+/// All lanes the same.
+#[inline(always)]
+pub(super) fn splat<T: Real>(value: T) -> Lanes<T> {
+    [value; LANES]
+}
+
+/// `a · b` in each lane.
+#[inline(always)]
+pub(super) fn times<T: Real>(a: &Lanes<T>, b: &Lanes<T>) -> Lanes<T> {
+    std::array::from_fn(|l| a[l] * b[l])
+}
+
+/// `a · b + c` in each lane, rounded once.
+#[inline(always)]
+pub(super) fn fused<T: Real>(a: &Lanes<T>, b: &Lanes<T>, c: &Lanes<T>) -> Lanes<T> {
+    std::array::from_fn(|l| a[l].mul_add(b[l], c[l]))
+}
+
+/// `a − b` in each lane.
+#[inline(always)]
+pub(super) fn minus<T: Real>(a: &Lanes<T>, b: &Lanes<T>) -> Lanes<T> {
+    std::array::from_fn(|l| a[l] - b[l])
+}
+
+/// The sum of the lanes, always in the same order, in `f64`.
+#[inline(always)]
+pub(super) fn sum<T: Real>(a: &Lanes<T>) -> f64 {
+    let half: [f64; 4] = std::array::from_fn(|l| a[l].to_f64() + a[l + 4].to_f64());
+    (half[0] + half[2]) + (half[1] + half[3])
+}
+
+/// Runs an expression with a constant for the stride of intrinsics, so that loops over it are unrolled.
+macro_rules! by_stride {
+    ($stride:expr, $k:ident => $work:expr) => {
+        by_stride!(@ $stride, $k, $work, 0 1 2 3 4 6 8 12)
+    };
+    (@ $stride:expr, $k:ident, $work:expr, $($n:literal)*) => {
+        match $stride {
+            $($n => {
+                const $k: usize = $n;
+                $work
+            })*
+            _ => {
+                const $k: usize = terrane_geometry::camera::MAX_PARAMS;
+                $work
+            }
+        }
+    };
+}
+pub(super) use by_stride;

@@ -1,0 +1,390 @@
+//! The camera side of the implicit solver: gathers what the parts answer, and solves for steps.
+
+use std::sync::Arc;
+
+use nalgebra::{SVector, Vector3};
+
+use super::super::explicit::unconstrained;
+use super::super::layout::{Cameras, NONE};
+use super::super::levenberg_marquardt::{Backend, Linearised};
+use super::super::plan::Dropped;
+use super::super::reduced::prior_cost;
+use super::super::step::Tried;
+use super::super::{BundleError, BundleOptions, BundleProblem, BundleReport, Preconditioner, Shards};
+use super::clusters::{Parted, Views, make_parts};
+use super::conjugate_gradients;
+use super::host::{LocalHost, PartHost};
+use super::local::cluster_indices;
+use super::preconditioner::{BlockFactors, Coarse, Extra, Inverse, PosePrior};
+use super::priors::{PriorRow, prior_rows};
+use super::state::packed;
+use super::system::{CameraSystem, Preconditioned};
+use super::worker::{CameraSide, PartRequest, PartWorker};
+
+/// A problem whose parts are held by somebody.
+pub(in super::super) struct Implicit<'a> {
+    shards: &'a dyn Shards,
+    origins: Vec<Vec<(u32, u32)>>,
+    driver: Driver,
+    free_points: bool,
+}
+
+/// The camera side, whoever holds the parts.
+pub(super) struct Driver {
+    side: Arc<CameraSide>,
+    host: Box<dyn PartHost>,
+    /// The poses of each part.
+    poses: Vec<Vec<u32>>,
+    cameras: Cameras,
+    next: Option<Cameras>,
+    sums: Sums,
+    inverse: Inverse,
+    linear_iterations: u64,
+}
+
+/// What all parts and priors add up to, by unknown.
+#[derive(Default)]
+struct Sums {
+    /// The gradient, negated.
+    descent: Vec<f64>,
+    /// The same after elimination.
+    reduced_descent: Vec<f64>,
+    /// The diagonal that is damped.
+    diagonal: Vec<f64>,
+    /// `λ D`.
+    damping: Vec<f64>,
+    /// Packed normal equations of each pose, with priors.
+    normal: Vec<f64>,
+    /// Packed diagonal blocks of the reduced system, with priors.
+    reduced: Vec<f64>,
+    /// Packed blocks of the intrinsics that poses share.
+    shared: Vec<Vec<f64>>,
+    priors: Vec<PriorRow>,
+    steepest: f64,
+}
+
+impl<'a> Implicit<'a> {
+    /// Reads every shard twice: what takes part and what sees what, then the parts.
+    pub fn prepare(
+        problem: &BundleProblem,
+        shards: &'a dyn Shards,
+        options: &BundleOptions,
+        report: &mut BundleReport,
+    ) -> Result<Self, BundleError> {
+        let cameras = Cameras::new(problem.poses.clone(), problem.intrinsics.clone());
+        let num_poses = problem.poses.len();
+        let mut views = Views::new(num_poses);
+        let mut dropped = Vec::with_capacity(shards.len());
+        for index in 0..shards.len() {
+            let shard = shards.load(index)?;
+            shard.validate(index, num_poses)?;
+            let out = Dropped::find(&shard, problem, &cameras);
+            let mut skip = out.observations.iter().copied().peekable();
+            let mut last = None;
+            for (i, o) in shard.observations.iter().enumerate() {
+                if skip.next_if_eq(&(i as u32)).is_none() {
+                    views.add(o.pose, &shard.points[o.point as usize]);
+                    report.observations += 1;
+                    report.points += u64::from(last != Some(o.point));
+                    last = Some(o.point);
+                }
+            }
+            report.behind_camera += out.behind_camera;
+            report.seen_once += out.seen_once;
+            dropped.push(out);
+        }
+        let clusters = views.cluster(problem);
+        let Parted { parts, origins } = make_parts(shards, &dropped, &clusters)?;
+        let free_points = parts.iter().any(|part| part.first_fixed_point > 0);
+        let side = CameraSide::new(problem.clone(), options.clone(), &views.observed(), clusters);
+        report.unconstrained_poses = unconstrained(problem, &side.layout, None);
+        report.reduced_unknowns = side.map.num_unknowns as u64;
+        let side = Arc::new(side);
+        let poses = parts.iter().map(|part| part.poses.clone()).collect();
+        let numbered = parts.into_iter().enumerate().map(|(index, part)| (index as u32, part)).collect();
+        let host = Box::new(LocalHost(PartWorker::new(side.clone(), numbered)?));
+        Ok(Self { shards, origins, driver: Driver::new(side, host, poses)?, free_points })
+    }
+
+    /// Whether any parameter may move and anything says where to.
+    pub fn anything_to_adjust(&self, report: &BundleReport) -> bool {
+        let side = &self.driver.side;
+        let any = report.observations > 0 || !side.problem.position_priors.is_empty();
+        any && (side.map.num_unknowns > 0 || self.free_points)
+    }
+
+    /// Iterations of conjugate gradients so far.
+    pub fn linear_iterations(&self) -> u64 {
+        self.driver.linear_iterations
+    }
+
+    /// The accepted cameras, and the accepted points of each shard.
+    pub fn into_result(mut self) -> Result<(Cameras, Vec<Vec<Vector3<f64>>>), BundleError> {
+        let mut points = Vec::with_capacity(self.shards.len());
+        for index in 0..self.shards.len() {
+            points.push(self.shards.load(index)?.points.clone());
+        }
+        let answers = self.driver.host.ask(&PartRequest::Points)?;
+        for (origins, answer) in self.origins.iter().zip(&answers) {
+            for ((shard, point), x) in origins.iter().zip(answer.as_chunks::<3>().0) {
+                points[*shard as usize][*point as usize] = Vector3::from(*x);
+            }
+        }
+        Ok((self.driver.cameras, points))
+    }
+}
+
+impl Backend for Implicit<'_> {
+    fn linearise(&mut self, damping: f64, anew: bool) -> Result<Linearised, BundleError> {
+        self.driver.linearise(damping, anew)
+    }
+
+    fn try_step(&mut self, damping: f64) -> Result<Option<Tried>, BundleError> {
+        self.driver.try_step(damping)
+    }
+
+    fn accept(&mut self) -> Result<(), BundleError> {
+        self.driver.accept()
+    }
+}
+
+impl Driver {
+    pub fn new(
+        side: Arc<CameraSide>,
+        host: Box<dyn PartHost>,
+        poses: Vec<Vec<u32>>,
+    ) -> Result<Self, BundleError> {
+        let kind = match side.options.preconditioner {
+            Preconditioner::Auto => Preconditioner::TwoLevel,
+            kind => kind,
+        };
+        if kind == Preconditioner::PowerSeries && !side.map.shared.is_empty() {
+            return Err(BundleError::invalid(
+                "the power series needs intrinsics that no two poses share: hold them, or choose two-level".to_owned(),
+            ));
+        }
+        let cameras = Cameras::new(side.problem.poses.clone(), side.problem.intrinsics.clone());
+        let frame = side.frame(&cameras);
+        let coarse = match kind {
+            Preconditioner::TwoLevel => {
+                let touched = poses.iter().map(|poses| side.coarse.of_poses(&frame, poses)).collect();
+                Some(Coarse::new(&side, touched)?)
+            }
+            _ => None,
+        };
+        let by_cluster = matches!(kind, Preconditioner::TwoLevel | Preconditioner::ClusterBlocks);
+        let cluster_indices = match by_cluster {
+            true => side.clusters.members.iter().map(|members| cluster_indices(&side.map, members)).collect(),
+            false => Vec::new(),
+        };
+        let factors = BlockFactors::new(&side, &[], &[], false);
+        let inverse = Inverse { kind, factors, coarse, cluster_indices };
+        Ok(Self { side, host, poses, cameras, next: None, sums: Sums::default(), inverse, linear_iterations: 0 })
+    }
+
+    fn linearise(&mut self, damping: f64, anew: bool) -> Result<Linearised, BundleError> {
+        let answers = self.host.ask(&PartRequest::Linearise { damping, anew })?;
+        let mut cost = self.gather(&answers);
+        self.add_priors();
+        cost += prior_cost(&self.side.problem, &self.side.layout, &self.cameras, &self.side.options);
+        let tiny = f64::MIN_POSITIVE.sqrt();
+        for d in &mut self.sums.diagonal {
+            // A parameter without any effect stays where it is.
+            *d = d.max(tiny);
+        }
+        self.sums.damping = self.sums.diagonal.iter().map(|d| (damping * d).max(tiny)).collect();
+        let slopes = self.sums.descent.iter().zip(&self.sums.diagonal).map(|(g, d)| g * g / d);
+        Ok(Linearised { cost, steepest: slopes.fold(self.sums.steepest, f64::max) })
+    }
+
+    /// Adds up what parts answered to [`PartRequest::Linearise`]; the cost.
+    fn gather(&mut self, answers: &[Vec<f64>]) -> f64 {
+        let (map, width) = (&self.side.map, self.side.map.width());
+        let (n, num_poses) = (map.num_unknowns, map.of_pose.len());
+        let sums = &mut self.sums;
+        let (mut gradient, mut reduced_gradient) = (vec![0.0; n], vec![0.0; n]);
+        sums.normal = vec![0.0; packed(width) * num_poses];
+        sums.reduced = vec![0.0; packed(width) * num_poses];
+        sums.steepest = 0.0;
+        let mut cost = 0.0;
+        for (poses, answer) in self.poses.iter().zip(answers) {
+            let [part_cost, steepest, rest @ ..] = answer.as_slice() else { continue };
+            cost += part_cost;
+            sums.steepest = sums.steepest.max(*steepest);
+            let (g, rest) = rest.split_at(width * poses.len());
+            let (reduced_g, rest) = rest.split_at(width * poses.len());
+            let (normal, reduced) = rest.split_at(packed(width) * poses.len());
+            for (i, pose) in poses.iter().enumerate() {
+                map.scatter(*pose, &g[width * i..width * (i + 1)], &mut gradient);
+                map.scatter(*pose, &reduced_g[width * i..width * (i + 1)], &mut reduced_gradient);
+                let at = packed(width) * *pose as usize;
+                for k in 0..packed(width) {
+                    sums.normal[at + k] += normal[packed(width) * i + k];
+                    sums.reduced[at + k] += reduced[packed(width) * i + k];
+                }
+            }
+        }
+        sums.descent = gradient.iter().map(|g| -g).collect();
+        sums.reduced_descent = reduced_gradient.iter().map(|g| -g).collect();
+        sums.diagonal = vec![0.0; n];
+        let mut local = vec![0.0; width];
+        for (pose, block) in sums.normal.chunks_exact(packed(width)).enumerate() {
+            (0..width).for_each(|a| local[a] = block[packed(a) + a]);
+            map.scatter(pose as u32, &local, &mut sums.diagonal);
+        }
+        cost
+    }
+
+    fn add_priors(&mut self) {
+        let width = self.side.map.width();
+        let sums = &mut self.sums;
+        sums.priors = prior_rows(&self.side, &self.cameras, &self.side.options);
+        for row in &sums.priors {
+            for (a, ja) in row.jacobian.iter().enumerate() {
+                let slope = row.weight * ja * row.residual;
+                sums.descent[row.first + a] -= slope;
+                sums.reduced_descent[row.first + a] -= slope;
+                sums.diagonal[row.first + a] += row.weight * ja * ja;
+                let Some(pose) = row.pose else { continue };
+                for (b, jb) in row.jacobian[..=a].iter().enumerate() {
+                    let at = packed(width) * pose as usize + packed(row.local + a) + row.local + b;
+                    sums.normal[at] += row.weight * ja * jb;
+                    sums.reduced[at] += row.weight * ja * jb;
+                }
+            }
+        }
+    }
+
+    /// Builds the preconditioner for the damping at hand.
+    fn prepare(&mut self) -> Result<(), BundleError> {
+        let (side, sums) = (self.side.clone(), &mut self.sums);
+        let width = side.map.width();
+        let from = match self.inverse.kind {
+            Preconditioner::PowerSeries => &sums.normal,
+            _ => &sums.reduced,
+        };
+        let mut blocks = from.clone();
+        for (unknowns, block) in side.map.of_pose.iter().zip(blocks.chunks_exact_mut(packed(width))) {
+            if unknowns.pose != NONE {
+                (0..6).for_each(|a| block[packed(a) + a] += sums.damping[unknowns.pose as usize + a]);
+            }
+            for a in 0..unknowns.num_intrinsics as usize {
+                block[packed(6 + a) + 6 + a] += sums.damping[unknowns.intrinsics as usize + a];
+            }
+        }
+        sums.shared = shared_blocks(&side, from, &sums.damping, &sums.priors);
+        let by_cluster = !self.inverse.cluster_indices.is_empty();
+        self.inverse.factors = BlockFactors::new(&side, &blocks, &sums.shared, !by_cluster);
+        if !by_cluster {
+            return Ok(());
+        }
+        let coarse = self.inverse.coarse.is_some();
+        let answers = self.host.ask(&PartRequest::Prepare { diagonal: blocks, coarse })?;
+        if let Some(coarse) = &mut self.inverse.coarse {
+            let (pose_priors, shared_priors) = coarse_priors(&side, &sums.priors);
+            let extra =
+                Extra { damping: &sums.damping, pose_priors: &pose_priors, shared_priors: &shared_priors };
+            coarse.assemble(&side, &self.cameras, &answers, &extra);
+        }
+        Ok(())
+    }
+
+    fn try_step(&mut self, damping: f64) -> Result<Option<Tried>, BundleError> {
+        self.prepare()?;
+        let side = self.side.clone();
+        let solved = {
+            let Self { host, poses, sums, inverse, .. } = self;
+            let system = CameraSystem {
+                side: &side,
+                host: host.as_mut(),
+                poses,
+                damping: &sums.damping,
+                priors: &sums.priors,
+            };
+            let options = &side.options;
+            let mut system = Preconditioned { system, inverse };
+            let (tolerance, most) = (options.linear_tolerance, options.max_linear_iterations);
+            conjugate_gradients::solve(&mut system, &sums.reduced_descent, tolerance, most)?
+        };
+        self.linear_iterations += u64::from(solved.iterations);
+        let step = &solved.x;
+        if !step.iter().all(|h| h.is_finite()) {
+            return Ok(None);
+        }
+        let Some(next) = self.cameras.stepped(&side.layout, step) else { return Ok(None) };
+        // ½ h·(λ D h + descent + what conjugate gradients left over).
+        let model: f64 = (0..step.len())
+            .map(|i| {
+                let damped = damping * self.sums.diagonal[i] * step[i];
+                0.5 * step[i] * (damped + self.sums.descent[i] + solved.residual[i])
+            })
+            .sum();
+        let mut sum = Tried {
+            cost: prior_cost(&side.problem, &side.layout, &next, &side.options),
+            model_reduction: model,
+            step_squared: step.iter().map(|h| h * h).sum(),
+            norm_squared: self.cameras.squared_norm(&side.layout),
+        };
+        let answers = self.host.ask(&PartRequest::Try { damping, step: solved.x })?;
+        for answer in &answers {
+            if let [cost, model_reduction, step_squared, norm_squared] = answer[..] {
+                sum = sum.plus(&Tried { cost, model_reduction, step_squared, norm_squared });
+            }
+        }
+        self.next = Some(next);
+        Ok(Some(sum))
+    }
+
+    fn accept(&mut self) -> Result<(), BundleError> {
+        if let Some(next) = self.next.take() {
+            self.host.ask(&PartRequest::Accept)?;
+            self.cameras = next;
+        }
+        Ok(())
+    }
+}
+
+/// The blocks of the intrinsics that poses share: sums over the poses, damped once.
+fn shared_blocks(side: &CameraSide, blocks: &[f64], damping: &[f64], priors: &[PriorRow]) -> Vec<Vec<f64>> {
+    let width = side.map.width();
+    let mut shared: Vec<Vec<f64>> =
+        side.map.shared.iter().map(|(_, n)| vec![0.0; packed(*n as usize)]).collect();
+    let find = |first: u32| side.map.shared.binary_search_by_key(&first, |(first, _)| *first).ok();
+    for (unknowns, block) in side.map.of_pose.iter().zip(blocks.chunks_exact(packed(width))) {
+        let Some(at) = (unknowns.num_intrinsics > 0).then(|| find(unknowns.intrinsics)).flatten() else { continue };
+        for a in 0..unknowns.num_intrinsics as usize {
+            for b in 0..=a {
+                shared[at][packed(a) + b] += block[packed(6 + a) + 6 + b];
+            }
+        }
+    }
+    for ((first, n), block) in side.map.shared.iter().zip(&mut shared) {
+        for a in 0..*n as usize {
+            block[packed(a) + a] += damping[*first as usize + a];
+        }
+        let inside = |row: &&PriorRow| (*first as usize..(*first + *n) as usize).contains(&row.first);
+        for row in priors.iter().filter(inside) {
+            let a = row.first - *first as usize;
+            block[packed(a) + a] += row.weight * row.jacobian[0] * row.jacobian[0];
+        }
+    }
+    shared
+}
+
+/// The priors as the coarse level wants them.
+fn coarse_priors(side: &CameraSide, priors: &[PriorRow]) -> (Vec<Vec<PosePrior>>, Vec<f64>) {
+    let mut of_pose: Vec<Vec<PosePrior>> = (0..side.map.of_pose.len()).map(|_| Vec::new()).collect();
+    let mut shared = vec![0.0; side.map.num_unknowns];
+    for row in priors {
+        match row.pose {
+            Some(pose) if row.local < 6 => {
+                let mut jacobian = SVector::<f64, 6>::zeros();
+                row.jacobian.iter().enumerate().for_each(|(a, j)| jacobian[row.local + a] = *j);
+                of_pose[pose as usize].push(PosePrior { jacobian, weight: row.weight });
+            }
+            Some(_) => {}
+            None => shared[row.first] += row.weight * row.jacobian[0] * row.jacobian[0],
+        }
+    }
+    (of_pose, shared)
+}

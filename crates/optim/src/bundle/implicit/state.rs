@@ -1,0 +1,215 @@
+//! A part at one point of the search: linearised, its points eliminated.
+
+use nalgebra::Vector3;
+
+use super::super::layout::{Cameras, Layout};
+use super::super::linearisation::factorize_normal;
+use super::super::{BundleOptions, BundleProblem};
+use super::clusters::Clusters;
+use super::local::LocalFactor;
+use super::part::{CameraMap, Part};
+use super::product::{LaneArrays, Scratch, num_rows};
+use super::real::{LANES, Real, splat};
+
+/// What all parts are worked on against.
+pub(super) struct Frame<'a> {
+    pub problem: &'a BundleProblem,
+    pub options: &'a BundleOptions,
+    pub layout: &'a Layout,
+    pub map: &'a CameraMap,
+    pub clusters: &'a Clusters,
+    pub cameras: &'a Cameras,
+}
+
+/// The accepted and the tried points of a part, and its linearisation.
+pub(super) struct PartState<T> {
+    pub part: Part,
+    pub tried: Vec<Vector3<f64>>,
+    pub lanes: LaneArrays<T>,
+    /// Of each point the normal equations (lower triangle by rows) and the gradient, before damping.
+    pub normal: Vec<[f64; 9]>,
+    /// `L⁻¹ g` and the diagonal of each point.
+    pub reduced: Vec<[f64; 6]>,
+    pub scratch: Scratch<T>,
+    pub local: Option<LocalFactor<T>>,
+    pub sums: CameraSums,
+}
+
+/// Sums over the observations of each camera of a part, `6 + stride` wide; blocks are packed lower triangles by rows.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct CameraSums {
+    /// The gradient.
+    pub gradient: Vec<f64>,
+    /// The gradient after elimination.
+    pub reduced_gradient: Vec<f64>,
+    /// The normal equations, one block a camera.
+    pub normal: Vec<f64>,
+    /// The diagonal blocks of the reduced system.
+    pub reduced: Vec<f64>,
+    /// Cost, where it was linearised.
+    pub cost: f64,
+    /// The largest `g² / D` of a point's coordinate.
+    pub steepest: f64,
+}
+
+/// Values of a packed lower triangle.
+pub(super) const fn packed(width: usize) -> usize {
+    width * (width + 1) / 2
+}
+
+impl<T: Real> PartState<T> {
+    pub fn new(part: Part, stride: usize) -> Self {
+        let lanes = lane_arrays(&part, stride);
+        let n = part.points.len();
+        Self {
+            tried: part.points.clone(),
+            lanes,
+            normal: vec![[0.0; 9]; n],
+            reduced: vec![[0.0; 6]; n],
+            scratch: Scratch::default(),
+            local: None,
+            sums: CameraSums::default(),
+            part,
+        }
+    }
+
+    /// Residuals and Jacobians of all observations, at the accepted points.
+    pub fn linearise(&mut self, frame: &Frame<'_>) {
+        let width = frame.map.width();
+        let num_cameras = self.part.poses.len();
+        self.normal.fill([0.0; 9]);
+        self.lanes.rows.fill(splat(T::default()));
+        let sums = &mut self.sums;
+        sums.cost = 0.0;
+        sums.gradient.clear();
+        sums.gradient.resize(width * num_cameras, 0.0);
+        for camera in 0..num_cameras {
+            let pose = self.part.poses[camera] as usize;
+            let rotation = &frame.cameras.rotations[pose];
+            self.lanes.rotations[camera] = std::array::from_fn(|i| T::from_f64(rotation[i / 3][i % 3]));
+            let gradient = &mut self.sums.gradient[width * camera..width * (camera + 1)];
+            let first = self.part.first_observation[camera] as usize;
+            let end = self.part.first_observation[camera + 1] as usize;
+            for i in first..end {
+                let slot = LANES * self.lanes.first_group[camera] as usize + (i - first);
+                let point = self.part.point_of[i] as usize;
+                let x = &self.part.points[point];
+                let rows = &mut self.lanes.rows[num_rows(frame.map.stride) * (slot / LANES)..];
+                let normal = &mut self.normal[point];
+                let seen = Seen { pose, xy_px: self.part.xy_px[i], lane: slot % LANES };
+                self.sums.cost += linearise(frame, &seen, x, rows, normal, gradient);
+            }
+        }
+        self.sums.normal = self.lanes.normal_blocks(frame.map.stride);
+    }
+
+    /// Eliminates the points with this damping.
+    pub fn eliminate(&mut self, damping: f64, stride: usize) {
+        let mut steepest = 0.0f64;
+        for (point, normal) in self.normal.iter().enumerate() {
+            let free = point < self.part.first_fixed_point as usize;
+            let (terms, slope) = if free {
+                let [v @ .., _, _, _] = normal;
+                let v: &[f64; 6] = v;
+                factorize_normal(v, &[normal[6], normal[7], normal[8]], damping)
+            } else {
+                Default::default()
+            };
+            self.lanes.inverse[point] = terms.inverse.map(T::from_f64);
+            let (r, d) = (terms.reduced, terms.diagonal);
+            self.reduced[point] = [r[0], r[1], r[2], d[0], d[1], d[2]];
+            steepest = steepest.max(slope);
+        }
+        self.sums.steepest = steepest;
+        let sums = &mut self.sums;
+        sums.reduced.clone_from(&sums.normal);
+        sums.reduced_gradient.clone_from(&sums.gradient);
+        self.lanes.eliminate(stride, &self.reduced, &mut sums.reduced, &mut sums.reduced_gradient);
+    }
+}
+
+/// The lanes of a part, without values.
+fn lane_arrays<T: Real>(part: &Part, stride: usize) -> LaneArrays<T> {
+    let none = part.points.len() as u32;
+    let (mut first_group, mut points) = (vec![0u32], Vec::new());
+    for window in part.first_observation.windows(2) {
+        for chunk in part.point_of[window[0] as usize..window[1] as usize].chunks(LANES) {
+            let mut lanes = [none; LANES];
+            lanes[..chunk.len()].copy_from_slice(chunk);
+            points.push(lanes);
+        }
+        first_group.push(points.len() as u32);
+    }
+    LaneArrays {
+        rows: vec![splat(T::default()); num_rows(stride) * points.len()],
+        rotations: vec![[T::default(); 9]; part.poses.len()],
+        inverse: vec![[T::default(); 6]; part.points.len() + 1],
+        first_group,
+        points,
+    }
+}
+
+/// One observation and where it goes.
+struct Seen {
+    pose: usize,
+    xy_px: [f32; 2],
+    lane: usize,
+}
+
+/// Linearises one observation; its cost. One that can't be projected weighs nothing.
+#[inline(always)]
+fn linearise<T: Real>(
+    frame: &Frame<'_>,
+    seen: &Seen,
+    x: &Vector3<f64>,
+    rows: &mut [[T; LANES]],
+    normal: &mut [f64; 9],
+    gradient: &mut [f64],
+) -> f64 {
+    let camera = &frame.cameras.intrinsics[frame.problem.intrinsics_of_pose[seen.pose] as usize];
+    let x_in_cam = frame.cameras.x_in_cam(seen.pose, x);
+    let Some(projection) = camera.project_with_jacobian(&x_in_cam) else { return 0.0 };
+    let residual = [0, 1].map(|row| projection.xy_px[row] - f64::from(seen.xy_px[row]));
+    let squared = residual[0] * residual[0] + residual[1] * residual[1];
+    let (rho, weight) = frame.options.loss.evaluate(squared, frame.options.loss_scale_px);
+    let root = weight.sqrt();
+    let residual = residual.map(|r| root * r);
+    let lane = seen.lane;
+    let rotation = &frame.cameras.rotations[seen.pose];
+    let mut point = [[0.0; 3]; 2];
+    let mut force = [0.0; 3];
+    for c in 0..3 {
+        rows[c][lane] = T::from_f64(x_in_cam[c]);
+        for row in 0..2 {
+            let d = root * projection.d_point[(row, c)];
+            let kept = T::from_f64(d);
+            rows[3 + 3 * row + c][lane] = kept;
+            force[c] += d * residual[row];
+            // The normal equations are those of the Jacobians that products use, so that S stays semidefinite.
+            (0..3).for_each(|a| point[row][a] += kept.to_f64() * rotation[c][a]);
+        }
+    }
+    for row in 0..2 {
+        let j = &point[row];
+        let products = [j[0] * j[0], j[1] * j[0], j[1] * j[1], j[2] * j[0], j[2] * j[1], j[2] * j[2]];
+        (0..6).for_each(|i| normal[i] += products[i]);
+    }
+    for a in 0..3 {
+        // The gradient is exact: what is rounded is only the way to its zero.
+        normal[6 + a] += force[0] * rotation[0][a] + force[1] * rotation[1][a] + force[2] * rotation[2][a];
+        let (b, c) = ((a + 1) % 3, (a + 2) % 3);
+        gradient[a] += x_in_cam[b] * force[c] - x_in_cam[c] * force[b];
+        gradient[3 + a] += force[a];
+    }
+    let variable = frame.layout.intrinsics_variable_of_pose[seen.pose];
+    if variable != super::super::layout::NONE {
+        let stride = frame.map.stride;
+        for (a, &param) in frame.layout.params[variable as usize].iter().enumerate() {
+            let d = [0, 1].map(|row| root * projection.d_params[(row, param)]);
+            rows[9 + a][lane] = T::from_f64(d[0]);
+            rows[9 + stride + a][lane] = T::from_f64(d[1]);
+            gradient[6 + a] += d[0] * residual[0] + d[1] * residual[1];
+        }
+    }
+    0.5 * rho
+}
