@@ -3,13 +3,13 @@
 use nalgebra::Vector3;
 
 use super::layout::{Cameras, Layout};
+use super::levenberg_marquardt::{Backend, Linearised};
 use super::linearisation::{Context, Linearisation};
 use super::pattern::Covisibility;
 use super::plan::{Dropped, ShardPlan};
 use super::reduced::{Reduced, prior_cost};
 use super::schur::{self, PoseRow};
 use super::step::{CameraStep, Tried, try_step};
-use super::levenberg_marquardt::{Backend, Linearised};
 use super::{BundleError, BundleOptions, BundleProblem, BundleReport, BundleShard, Gauge, Shards};
 
 /// What the solve keeps of a shard.

@@ -8,7 +8,7 @@
 //! a camera is shortened for this point; if that does not help it counts as no descent.
 
 mod explicit;
-mod implicit;
+pub mod implicit;
 mod layout;
 mod levenberg_marquardt;
 mod linearisation;

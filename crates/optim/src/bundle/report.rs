@@ -40,6 +40,8 @@ pub struct BundleReport {
     pub solver: BundleSolver,
     /// Iterations of conjugate gradients, all steps together; none where the system was factorised.
     pub linear_iterations: u64,
+    /// Clusters of cameras that the solve was cut into; none where the system was factorised.
+    pub clusters: u32,
     /// Linear solves, accepted or not.
     pub iterations: u32,
     /// Steps that lowered the cost.
@@ -67,6 +69,7 @@ impl BundleReport {
             final_cost: 0.0,
             solver: BundleSolver::Auto,
             linear_iterations: 0,
+            clusters: 0,
             iterations: 0,
             accepted_steps: 0,
             termination: Termination::NothingToAdjust,

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use super::explicit::Explicit;
-use super::implicit::Implicit;
+use super::implicit::solve_here;
 use super::layout::Cameras;
 use super::levenberg_marquardt::minimise;
 use super::{BundleError, BundleOptions, BundleProblem, BundleReport, BundleSolver, Gauge, Shards};
@@ -32,7 +32,7 @@ pub fn solve(
     let mut report = BundleReport::empty();
     report.solver = choose(problem, options)?;
     let (cameras, points) = match report.solver {
-        BundleSolver::Implicit => solve_implicit(problem, shards, options, &mut report)?,
+        BundleSolver::Implicit => solve_here(problem, shards, options, &mut report)?,
         _ => solve_explicit(problem, shards, options, &mut report)?,
     };
     for (i, points) in points.iter().enumerate() {
@@ -57,23 +57,11 @@ fn solve_explicit(
     Ok(explicit.into_result())
 }
 
-fn solve_implicit(
-    problem: &BundleProblem,
-    shards: &dyn Shards,
-    options: &BundleOptions,
-    report: &mut BundleReport,
-) -> Result<Solution, BundleError> {
-    let mut implicit = Implicit::prepare(problem, shards, options, report)?;
-    let anything = implicit.anything_to_adjust(report);
-    report.termination = minimise(&mut implicit, options, anything, report)?;
-    report.linear_iterations = implicit.linear_iterations();
-    implicit.into_result()
-}
-
 /// What [`BundleSolver::Auto`] stands for.
 fn choose(problem: &BundleProblem, options: &BundleOptions) -> Result<BundleSolver, BundleError> {
     let free = problem.fixed_poses.iter().filter(|fixed| !**fixed).count();
-    let refined = problem.refine.iter().zip(&problem.intrinsics).map(|(refine, camera)| refine.params(camera).len());
+    let refined =
+        problem.refine.iter().zip(&problem.intrinsics).map(|(refine, camera)| refine.params(camera).len());
     let unknowns = 6 * free + refined.sum::<usize>();
     match (options.solver, options.gauge) {
         (BundleSolver::Implicit, Gauge::TwoPoses) => Err(BundleError::invalid(

@@ -1,7 +1,7 @@
 //! Block sums over the observations of each camera: normal equations, and what elimination takes from them.
 
-use super::product::{LaneArrays, num_rows};
-use super::real::{Lanes, Real, by_stride, fused, splat, sum, times};
+use super::product::{LaneArrays, num_rows, turned_back};
+use super::real::{Lanes, Real, by_stride, fused, minus, splat, sum, times};
 use super::state::packed;
 
 /// The most unknowns of a camera.
@@ -19,7 +19,7 @@ impl<T: Real> LaneArrays<T> {
         let width = 6 + stride;
         let mut blocks = vec![0.0; packed(width) * self.rotations.len()];
         for (camera, block) in blocks.chunks_exact_mut(packed(width)).enumerate() {
-            by_stride!(stride, K => widest(|| self.add_normal::<K>(camera, block)));
+            by_stride!(stride, K => widest(#[inline(always)] || self.add_normal::<K>(camera, block)));
         }
         blocks
     }
@@ -42,12 +42,12 @@ impl<T: Real> LaneArrays<T> {
         block.iter_mut().zip(&sums).for_each(|(value, lanes)| *value = sum(lanes));
     }
 
-    /// Takes `Σ Z Zᵀ` from the blocks and `Σ Z L⁻¹ g` from the gradients; `reduced` begins with `L⁻¹ g` of each point.
-    pub fn eliminate(&self, stride: usize, reduced: &[[f64; 6]], blocks: &mut [f64], gradients: &mut [f64]) {
+    /// Takes `Σ Z Zᵀ` from the blocks and `Σ Z L⁻¹ g` from the gradients; `reduced` is `L⁻¹ g` of each point.
+    pub fn eliminate(&self, stride: usize, reduced: &[[f64; 3]], blocks: &mut [f64], gradients: &mut [f64]) {
         let width = 6 + stride;
         let cameras = blocks.chunks_exact_mut(packed(width)).zip(gradients.chunks_exact_mut(width));
         for (camera, (block, gradient)) in cameras.enumerate() {
-            by_stride!(stride, K => widest(|| self.eliminate_camera::<K>(camera, reduced, block, gradient)));
+            by_stride!(stride, K => widest(#[inline(always)] || self.eliminate_camera::<K>(camera, reduced, block, gradient)));
         }
     }
 
@@ -55,7 +55,7 @@ impl<T: Real> LaneArrays<T> {
     fn eliminate_camera<const K: usize>(
         &self,
         camera: usize,
-        reduced: &[[f64; 6]],
+        reduced: &[[f64; 3]],
         block: &mut [f64],
         gradient: &mut [f64],
     ) {
@@ -96,8 +96,7 @@ impl<T: Real> LaneArrays<T> {
             let d = &rows[3 + 3 * row..6 + 3 * row];
             for a in 0..3 {
                 let (b, c) = ((a + 1) % 3, (a + 2) % 3);
-                let turn = times(&rows[c], &d[b]);
-                jacobian[a][row] = std::array::from_fn(|l| rows[b][l] * d[c][l] - turn[l]);
+                jacobian[a][row] = minus(&times(&rows[b], &d[c]), &times(&rows[c], &d[b]));
                 jacobian[3 + a][row] = d[a];
             }
             for a in 0..K {
@@ -111,29 +110,26 @@ impl<T: Real> LaneArrays<T> {
     #[inline(always)]
     pub fn group_z<const K: usize>(&self, camera: usize, group: usize) -> GroupZ<T> {
         let rows = &self.rows[num_rows(K) * group..num_rows(K) * (group + 1)];
-        let rotation = self.rotations[camera].map(splat);
+        let rotation = self.rotation(camera);
         let mut inverse = [splat(T::default()); 6];
         for (l, point) in self.points[group].iter().enumerate() {
             let of_point = &self.inverse[*point as usize];
             (0..6).for_each(|i| inverse[i][l] = of_point[i]);
         }
         // J_p = d R, then J_p L⁻ᵀ.
-        let scaled: [[Lanes<T>; 3]; 2] = std::array::from_fn(|row| {
-            let d = &rows[3 + 3 * row..6 + 3 * row];
-            let j: [Lanes<T>; 3] = std::array::from_fn(|c| {
-                let sum = times(&rotation[c], &d[0]);
-                fused(&rotation[6 + c], &d[2], &fused(&rotation[3 + c], &d[1], &sum))
-            });
+        let mut scaled = [[splat(T::default()); 3]; 2];
+        for (row, scaled) in scaled.iter_mut().enumerate() {
+            let j = turned_back(&rotation, &rows[3 + 3 * row..6 + 3 * row]);
             let second = fused(&j[1], &inverse[2], &times(&j[0], &inverse[1]));
             let third = fused(&j[2], &inverse[5], &fused(&j[1], &inverse[4], &times(&j[0], &inverse[3])));
-            [times(&j[0], &inverse[0]), second, third]
-        });
+            *scaled = [times(&j[0], &inverse[0]), second, third];
+        }
         let jacobian = self.camera_rows::<K>(group);
         let mut z = [[splat(T::default()); 3]; MAX_WIDTH];
         for a in 0..6 + K {
-            z[a] = std::array::from_fn(|c| {
-                fused(&jacobian[a][1], &scaled[1][c], &times(&jacobian[a][0], &scaled[0][c]))
-            });
+            for c in 0..3 {
+                z[a][c] = fused(&jacobian[a][1], &scaled[1][c], &times(&jacobian[a][0], &scaled[0][c]));
+            }
         }
         z
     }

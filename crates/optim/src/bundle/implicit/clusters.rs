@@ -154,7 +154,10 @@ fn add_shard(
 fn majority(seen: &[(u32, [f32; 2])], clusters: &Clusters, tally: &mut [u32]) -> Option<u32> {
     let cluster = |pose: u32| clusters.of_pose[pose as usize];
     seen.iter().for_each(|(pose, _)| tally[cluster(*pose) as usize] += 1);
-    let best = seen.iter().map(|(pose, _)| cluster(*pose)).max_by_key(|c| (tally[*c as usize], std::cmp::Reverse(*c)));
+    let best = seen
+        .iter()
+        .map(|(pose, _)| cluster(*pose))
+        .max_by_key(|c| (tally[*c as usize], std::cmp::Reverse(*c)));
     seen.iter().for_each(|(pose, _)| tally[cluster(*pose) as usize] = 0);
     best
 }

@@ -7,8 +7,8 @@ use nalgebra::{Matrix3, SMatrix, Vector3};
 
 use super::super::layout::{Cameras, NONE};
 use super::clusters::Clusters;
-use super::real::{LANES, Real};
 use super::product::num_rows;
+use super::real::{LANES, Real};
 use super::state::{Frame, PartState};
 
 /// Unknowns of a similarity: rotation, translation, scale.
@@ -100,7 +100,12 @@ impl<T: Real> PartState<T> {
     /// What the part's points add to `Pᵀ S P`, dense over the groups that they touch: a lower triangle, column-major.
     ///
     /// Points whose cameras all belong to one cluster follow it for free, but for the damping of points, which is left out.
-    pub fn coarse_matrix(&self, frame: &Frame<'_>, groups: &CoarseGroups, middles: &[Vector3<f64>]) -> Vec<f64> {
+    pub fn coarse_matrix(
+        &self,
+        frame: &Frame<'_>,
+        groups: &CoarseGroups,
+        middles: &[Vector3<f64>],
+    ) -> Vec<f64> {
         let touched = groups.of_poses(frame, &self.part.poses);
         let dims = groups.dims();
         let mut offsets = Vec::with_capacity(touched.len());
@@ -110,16 +115,23 @@ impl<T: Real> PartState<T> {
             n += dims[*group as usize];
         }
         let place = |group: u32| touched.binary_search(&group).ok().map(|at| offsets[at]);
-        let places: Vec<CameraPlace> = self.part.poses.iter().map(|pose| {
-            let unknowns = &frame.map.of_pose[*pose as usize];
-            let cluster = frame.clusters.of_pose[*pose as usize];
-            let similarity = (unknowns.pose != NONE).then(|| place(cluster)).flatten().map(|at| {
-                (at, pose_columns(frame.cameras, *pose as usize, &middles[cluster as usize]))
-            });
-            let shared = (unknowns.intrinsics != NONE).then(|| groups.of_shared(unknowns.intrinsics)).flatten();
-            let shared = shared.and_then(place).map(|at| (at, unknowns.num_intrinsics as usize));
-            CameraPlace { similarity, shared }
-        }).collect();
+        let places: Vec<CameraPlace> = self
+            .part
+            .poses
+            .iter()
+            .map(|pose| {
+                let unknowns = &frame.map.of_pose[*pose as usize];
+                let cluster = frame.clusters.of_pose[*pose as usize];
+                let similarity = (unknowns.pose != NONE)
+                    .then(|| place(cluster))
+                    .flatten()
+                    .map(|at| (at, pose_columns(frame.cameras, *pose as usize, &middles[cluster as usize])));
+                let shared =
+                    (unknowns.intrinsics != NONE).then(|| groups.of_shared(unknowns.intrinsics)).flatten();
+                let shared = shared.and_then(place).map(|at| (at, unknowns.num_intrinsics as usize));
+                CameraPlace { similarity, shared }
+            })
+            .collect();
         let mut matrix = vec![0.0; n * n];
         let lists = self.observations_of_points(&places);
         for (point, list) in lists {
@@ -133,7 +145,8 @@ impl<T: Real> PartState<T> {
         let anything_shared = places.iter().any(|place| place.shared.is_some());
         let mut first_seen = vec![u32::MAX; self.part.points.len()];
         let mut crosses = vec![anything_shared; self.part.points.len()];
-        let group_of = |place: &CameraPlace| place.similarity.as_ref().map_or(u32::MAX - 1, |(at, _)| *at as u32);
+        let group_of =
+            |place: &CameraPlace| place.similarity.as_ref().map_or(u32::MAX - 1, |(at, _)| *at as u32);
         self.for_each_slot(|camera, _, point| {
             let group = group_of(&places[camera]);
             let first = &mut first_seen[point];
@@ -177,7 +190,8 @@ impl<T: Real> PartState<T> {
         let inverse = self.lanes.inverse[point as usize].map(|v| v.to_f64());
         let mut columns: Vec<(usize, [f64; 3])> = Vec::new();
         for &(camera, slot) in list {
-            let (rows, point_rows) = self.coarse_rows(camera as usize, slot as usize, &places[camera as usize], stride);
+            let (rows, point_rows) =
+                self.coarse_rows(camera as usize, slot as usize, &places[camera as usize], stride);
             let scaled = point_rows.map(|j| {
                 [
                     j[0] * inverse[0],
@@ -190,7 +204,8 @@ impl<T: Real> PartState<T> {
                     add_product(matrix, n, a, b);
                 }
                 for i in 0..a.len {
-                    let f = std::array::from_fn(|c| a.rows[0][i] * scaled[0][c] + a.rows[1][i] * scaled[1][c]);
+                    let f =
+                        std::array::from_fn(|c| a.rows[0][i] * scaled[0][c] + a.rows[1][i] * scaled[1][c]);
                     match columns.iter_mut().find(|(column, _)| *column == a.start + i) {
                         Some((_, sum)) => (0..3).for_each(|c| sum[c] += f[c]),
                         None => columns.push((a.start + i, f)),

@@ -10,6 +10,16 @@ pub trait PartHost {
     /// # Errors
     /// When a part can't be reached and nobody else can take it over.
     fn ask(&mut self, request: &PartRequest) -> Result<Vec<Vec<f64>>, BundleError>;
+
+    /// After a step was accepted: the cameras as numbers, from which a holder that joins later goes on.
+    fn accepted(&mut self, cameras: Vec<f64>) {
+        let _ = cameras;
+    }
+
+    /// Whether [`PartHost::accepted`] wants to know.
+    fn wants_cameras(&self) -> bool {
+        false
+    }
 }
 
 /// Parts in this process.
@@ -17,6 +27,6 @@ pub struct LocalHost(pub PartWorker);
 
 impl PartHost for LocalHost {
     fn ask(&mut self, request: &PartRequest) -> Result<Vec<Vec<f64>>, BundleError> {
-        Ok(self.0.answer(request).into_iter().map(|(_, answer)| answer).collect())
+        Ok(self.0.answer(request, None)?.into_iter().map(|(_, answer)| answer).collect())
     }
 }

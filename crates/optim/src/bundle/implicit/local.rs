@@ -7,7 +7,7 @@ use faer::{MatMut, Par};
 use super::super::layout::NONE;
 use super::blocks::widest;
 use super::part::CameraMap;
-use super::real::{LANES, Real, by_stride};
+use super::real::{LANES, Real, by_stride, fused};
 use super::state::{Frame, PartState, packed};
 
 /// One camera of a cluster.
@@ -57,7 +57,10 @@ impl<T: Real> LocalFactor<T> {
         for index in indices(owned, map) {
             work.push(T::from_f64(right[index]));
         }
-        widest(|| substitute(columns, inverse, work));
+        widest(
+            #[inline(always)]
+            || substitute(columns, inverse, work),
+        );
         work.iter().map(|v| v.to_f64()).collect()
     }
 }
@@ -142,7 +145,7 @@ impl<T: Real> PartState<T> {
         for (at, camera) in owned.iter().enumerate().filter(|(_, camera)| camera.camera != NONE) {
             let index = camera.camera as usize;
             for group in self.lanes.first_group[index] as usize..self.lanes.first_group[index + 1] as usize {
-                let z = by_stride!(stride, K => widest(|| self.lanes.group_z::<K>(index, group)));
+                let z = by_stride!(stride, K => widest(#[inline(always)] || self.lanes.group_z::<K>(index, group)));
                 for (l, point) in self.lanes.points[group].iter().enumerate() {
                     if *point < self.part.first_fixed_point {
                         seen.push((*point, at as u32));
@@ -166,7 +169,10 @@ impl<T: Real> PartState<T> {
                     let b = &owned[seen[*second as usize].1 as usize];
                     if a.offset != b.offset {
                         let zb = &values[3 * width * *second as usize..][..3 * b.num_rows()];
-                        widest(|| subtract_block(matrix, n, (b.offset as usize, zb), (a.offset as usize, za)));
+                        widest(
+                            #[inline(always)]
+                            || subtract_block(matrix, n, (b.offset as usize, zb), (a.offset as usize, za)),
+                        );
                     }
                 }
             }
@@ -193,7 +199,8 @@ fn subtract_block(
 
 fn add_diagonal(matrix: &mut [f64], n: usize, owned: &[Owned], width: usize, diagonal: &[f64]) {
     for camera in owned {
-        let block = &diagonal[packed(width) * camera.pose as usize..packed(width) * (camera.pose as usize + 1)];
+        let block =
+            &diagonal[packed(width) * camera.pose as usize..packed(width) * (camera.pose as usize + 1)];
         for (i, a) in camera.rows().enumerate() {
             for (j, b) in camera.rows().enumerate().take(i + 1) {
                 matrix[n * (camera.offset as usize + j) + camera.offset as usize + i] = block[packed(a) + b];
@@ -247,7 +254,7 @@ fn dot<T: Real>(a: &[T], b: &[T]) -> T {
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
     let mut sums = [T::default(); LANES];
     for (a, b) in a.iter().zip(b) {
-        sums = std::array::from_fn(|l| a[l].mul_add(b[l], sums[l]));
+        sums = fused(a, b, &sums);
     }
     let mut total = T::default();
     for value in sums {

@@ -12,6 +12,7 @@ mod conjugate_gradients;
 mod host;
 mod local;
 mod part;
+mod partition;
 mod preconditioner;
 mod priors;
 mod product;
@@ -25,6 +26,8 @@ mod worker;
 pub use clusters::Clusters;
 pub use host::{LocalHost, PartHost};
 pub use part::Part;
-pub use worker::{CameraSide, PartRequest, PartWorker};
+pub use partition::{Partition, partition};
+pub use solver::solve_parts;
+pub use worker::{CameraSide, PartRequest, PartStore, PartWorker};
 
-pub(super) use solver::Implicit;
+pub(super) use solver::solve_here;

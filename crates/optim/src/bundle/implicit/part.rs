@@ -45,7 +45,8 @@ impl Part {
         if ends != (Some(0), u32::try_from(n).ok()) || !self.first_observation.is_sorted() {
             return fail("its observations are not in order");
         }
-        if !self.poses.is_sorted_by(|a, b| a < b) || self.poses.last().is_some_and(|p| *p as usize >= num_poses)
+        if !self.poses.is_sorted_by(|a, b| a < b)
+            || self.poses.last().is_some_and(|p| *p as usize >= num_poses)
         {
             return fail("its poses are not in order or do not exist");
         }
@@ -97,7 +98,8 @@ impl CameraMap {
             }
         }
         let of_pose = (0..problem.poses.len()).map(|pose| {
-            let (variable, intrinsics) = (layout.pose_variable[pose], layout.intrinsics_variable_of_pose[pose]);
+            let (variable, intrinsics) =
+                (layout.pose_variable[pose], layout.intrinsics_variable_of_pose[pose]);
             let refined = intrinsics != NONE;
             CameraUnknowns {
                 pose: if variable == NONE { NONE } else { 6 * variable },

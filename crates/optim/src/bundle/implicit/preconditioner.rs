@@ -44,7 +44,11 @@ impl BlockFactors {
         let matrix = nalgebra::DMatrix::from_fn(n, n, at);
         let factor = matrix.clone().cholesky().map_or_else(
             // A block that rounding has spoiled: its diagonal.
-            || nalgebra::DMatrix::from_diagonal(&matrix.diagonal().map(|d| d.max(f64::MIN_POSITIVE.sqrt()).sqrt())),
+            || {
+                nalgebra::DMatrix::from_diagonal(
+                    &matrix.diagonal().map(|d| d.max(f64::MIN_POSITIVE.sqrt()).sqrt()),
+                )
+            },
             |cholesky| cholesky.unpack(),
         );
         self.blocks.push(BlockFactor { ranges, factor });
@@ -159,7 +163,8 @@ impl Coarse {
         self.system.solve_in_place(&mut right);
         for (pose, unknowns) in free() {
             let offset = SIMILARITY * side.clusters.of_pose[pose] as usize;
-            let step = self.columns[pose] * SVector::<f64, SIMILARITY>::from_column_slice(&right[offset..][..SIMILARITY]);
+            let step = self.columns[pose]
+                * SVector::<f64, SIMILARITY>::from_column_slice(&right[offset..][..SIMILARITY]);
             z[unknowns.pose as usize..][..6].iter_mut().zip(step.iter()).for_each(|(z, s)| *z += s);
         }
         for (at, (first, n)) in side.coarse.shared.iter().enumerate() {
@@ -197,7 +202,8 @@ fn add_part(system: &mut BlockSystem, dims: &[usize], groups: &[u32], matrix: &[
             let mut block = vec![0.0; rows * columns];
             for r in 0..rows {
                 for c in 0..columns {
-                    let (low, high) = ((row_offset + r).max(column_offset + c), (row_offset + r).min(column_offset + c));
+                    let (low, high) =
+                        ((row_offset + r).max(column_offset + c), (row_offset + r).min(column_offset + c));
                     block[columns * r + c] = matrix[n * high + low];
                 }
             }

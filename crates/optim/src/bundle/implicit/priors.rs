@@ -30,7 +30,8 @@ pub(super) fn prior_rows(side: &CameraSide, cameras: &Cameras, options: &BundleO
         }
         let center = cameras.poses[prior.pose as usize].center();
         let residual = (center - prior.center_in_world).component_div(&prior.sigma_m);
-        let (_, weight) = options.prior_loss.evaluate(residual.norm_squared(), options.prior_loss_scale_sigma);
+        let (_, weight) =
+            options.prior_loss.evaluate(residual.norm_squared(), options.prior_loss_scale_sigma);
         let rotation = &cameras.rotations[prior.pose as usize];
         for axis in 0..3 {
             // With (ω, v) on the left of cam_from_world the centre moves by −Rᵀ v.

@@ -4,9 +4,10 @@
 //! the pixel by that point, and by the refined intrinsics; all other Jacobians follow from these.
 
 use super::blocks::widest;
-use super::real::{LANES, Lanes, Real, by_stride, fused, minus, splat, sum, times};
+use super::real::{LANES, Lanes, Real, by_stride, each3, fused, minus, plus, splat, sum, times};
 
 /// The arrays of a linearised part.
+#[derive(Default)]
 pub(super) struct LaneArrays<T> {
     /// First group of each camera, then their number.
     pub first_group: Vec<u32>,
@@ -50,7 +51,7 @@ impl<T: Real> LaneArrays<T> {
         scratch.image.resize(self.points.len(), [splat(T::default()); 2]);
         scratch.point.clear();
         scratch.point.resize(self.inverse.len(), [T::default(); 4]);
-        by_stride!(stride, K => widest(|| self.run::<K>(x, y, scratch)));
+        by_stride!(stride, K => widest(#[inline(always)] || self.run::<K>(x, y, scratch)));
     }
 
     /// Only the first half: `J_pᵀ J_c x` of each point, for [`Scratch::asked_of`].
@@ -58,7 +59,7 @@ impl<T: Real> LaneArrays<T> {
         scratch.image.resize(self.points.len(), [splat(T::default()); 2]);
         scratch.point.clear();
         scratch.point.resize(self.inverse.len(), [T::default(); 4]);
-        by_stride!(stride, K => widest(|| {
+        by_stride!(stride, K => widest(#[inline(always)] || {
             for (camera, x) in x.chunks_exact(6 + K).enumerate() {
                 self.forward::<K>(camera, x, scratch);
             }
@@ -79,12 +80,27 @@ impl<T: Real> LaneArrays<T> {
         }
     }
 
+    /// The rotation of a camera in every lane.
+    #[inline(always)]
+    pub fn rotation(&self, camera: usize) -> [Lanes<T>; 9] {
+        let mut rotation = [splat(T::default()); 9];
+        for (lanes, value) in rotation.iter_mut().zip(&self.rotations[camera]) {
+            *lanes = splat(*value);
+        }
+        rotation
+    }
+
     /// `t = J_c x` of a camera's observations, and `J_pᵀ t` added to their points.
     #[inline(always)]
     fn forward<const K: usize>(&self, camera: usize, x: &[f64], scratch: &mut Scratch<T>) {
-        let pose: [Lanes<T>; 6] = std::array::from_fn(|a| splat(T::from_f64(x[a])));
-        let intrinsics: [Lanes<T>; K] = std::array::from_fn(|a| splat(T::from_f64(x[6 + a])));
-        let rotation = self.rotations[camera].map(splat);
+        let (mut pose, mut intrinsics) = ([splat(T::default()); 6], [splat(T::default()); K]);
+        for a in 0..6 {
+            pose[a] = splat(T::from_f64(x[a]));
+        }
+        for a in 0..K {
+            intrinsics[a] = splat(T::from_f64(x[6 + a]));
+        }
+        let rotation = self.rotation(camera);
         for group in self.first_group[camera] as usize..self.first_group[camera + 1] as usize {
             let rows = &self.rows[num_rows(K) * group..num_rows(K) * (group + 1)];
             let moved = motion(&pose, rows);
@@ -94,12 +110,7 @@ impl<T: Real> LaneArrays<T> {
                 image[1] = fused(&rows[9 + K + a], &intrinsics[a], &image[1]);
             }
             scratch.image[group] = image;
-            let in_cam: [Lanes<T>; 3] =
-                std::array::from_fn(|c| fused(&rows[6 + c], &image[1], &times(&rows[3 + c], &image[0])));
-            let in_world: [Lanes<T>; 3] = std::array::from_fn(|c| {
-                let sum = times(&rotation[c], &in_cam[0]);
-                fused(&rotation[6 + c], &in_cam[2], &fused(&rotation[3 + c], &in_cam[1], &sum))
-            });
+            let in_world = turned_back(&rotation, &force(rows, &image));
             let points = &self.points[group];
             for l in 0..LANES {
                 let sum = &mut scratch.point[points[l] as usize];
@@ -111,7 +122,7 @@ impl<T: Real> LaneArrays<T> {
     /// `y = J_cᵀ (t − J_p v)` of a camera.
     #[inline(always)]
     fn backward<const K: usize>(&self, camera: usize, y: &mut [f64], scratch: &Scratch<T>) {
-        let rotation = self.rotations[camera].map(splat);
+        let rotation = self.rotation(camera);
         let zero = splat(T::default());
         let (mut pose, mut intrinsics) = ([zero; 6], [zero; K]);
         for group in self.first_group[camera] as usize..self.first_group[camera + 1] as usize {
@@ -122,19 +133,18 @@ impl<T: Real> LaneArrays<T> {
                 let point = &scratch.point[points[l] as usize];
                 (v[0][l], v[1][l], v[2][l]) = (point[0], point[1], point[2]);
             }
-            let in_cam: [Lanes<T>; 3] = std::array::from_fn(|r| dot3(&rotation[3 * r..3 * r + 3], &v));
+            let in_cam = [dot3(&rotation[0..3], &v), dot3(&rotation[3..6], &v), dot3(&rotation[6..9], &v)];
             let image = &scratch.image[group];
             let rest = [
                 minus(&image[0], &dot3(&rows[3..6], &in_cam)),
                 minus(&image[1], &dot3(&rows[6..9], &in_cam)),
             ];
-            let force: [Lanes<T>; 3] =
-                std::array::from_fn(|c| fused(&rows[6 + c], &rest[1], &times(&rows[3 + c], &rest[0])));
+            let force = force(rows, &rest);
             for c in 0..3 {
                 let (a, b) = ((c + 1) % 3, (c + 2) % 3);
                 let turn = minus(&times(&rows[a], &force[b]), &times(&rows[b], &force[a]));
-                pose[c] = std::array::from_fn(|l| pose[c][l] + turn[l]);
-                pose[3 + c] = std::array::from_fn(|l| pose[3 + c][l] + force[c][l]);
+                pose[c] = plus(&pose[c], &turn);
+                pose[3 + c] = plus(&pose[3 + c], &force[c]);
             }
             for a in 0..K {
                 intrinsics[a] = fused(&rows[9 + a], &rest[0], &intrinsics[a]);
@@ -150,11 +160,35 @@ impl<T: Real> LaneArrays<T> {
 /// How the point moves in the camera's frame: `ω × x + v`.
 #[inline(always)]
 fn motion<T: Real>(pose: &[Lanes<T>; 6], rows: &[Lanes<T>]) -> [Lanes<T>; 3] {
-    std::array::from_fn(|c| {
-        let (a, b) = ((c + 1) % 3, (c + 2) % 3);
-        let turn = minus(&times(&pose[a], &rows[b]), &times(&pose[b], &rows[a]));
-        std::array::from_fn(|l| turn[l] + pose[3 + c][l])
-    })
+    each3(
+        #[inline(always)]
+        |c| {
+            let (a, b) = ((c + 1) % 3, (c + 2) % 3);
+            let turn = minus(&times(&pose[a], &rows[b]), &times(&pose[b], &rows[a]));
+            plus(&turn, &pose[3 + c])
+        },
+    )
+}
+
+/// `dᵀ t`: what an image vector asks of the point in the camera's frame.
+#[inline(always)]
+fn force<T: Real>(rows: &[Lanes<T>], image: &[Lanes<T>; 2]) -> [Lanes<T>; 3] {
+    each3(
+        #[inline(always)]
+        |c| fused(&rows[6 + c], &image[1], &times(&rows[3 + c], &image[0])),
+    )
+}
+
+/// `Rᵀ x`.
+#[inline(always)]
+pub(super) fn turned_back<T: Real>(rotation: &[Lanes<T>; 9], x: &[Lanes<T>]) -> [Lanes<T>; 3] {
+    each3(
+        #[inline(always)]
+        |c| {
+            let sum = times(&rotation[c], &x[0]);
+            fused(&rotation[6 + c], &x[2], &fused(&rotation[3 + c], &x[1], &sum))
+        },
+    )
 }
 
 #[inline(always)]
@@ -169,10 +203,5 @@ pub(super) fn solve_point<T: Real>(inverse: &[T; 6], w: &[T; 4]) -> [T; 4] {
     let a = i[0] * w[0];
     let b = i[2].mul_add(w[1], i[1] * w[0]);
     let c = i[5].mul_add(w[2], i[4].mul_add(w[1], i[3] * w[0]));
-    [
-        i[3].mul_add(c, i[1].mul_add(b, i[0] * a)),
-        i[4].mul_add(c, i[2] * b),
-        i[5] * c,
-        T::default(),
-    ]
+    [i[3].mul_add(c, i[1].mul_add(b, i[0] * a)), i[4].mul_add(c, i[2] * b), i[5] * c, T::default()]
 }

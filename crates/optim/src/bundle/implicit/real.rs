@@ -59,28 +59,65 @@ pub(super) fn splat<T: Real>(value: T) -> Lanes<T> {
     [value; LANES]
 }
 
+/// One value for each lane; a loop, as closures of the standard library are not compiled for the caller's vectors.
+#[inline(always)]
+pub(super) fn each<T: Real>(value: impl Fn(usize) -> T) -> Lanes<T> {
+    let mut lanes = [T::default(); LANES];
+    for (l, lane) in lanes.iter_mut().enumerate() {
+        *lane = value(l);
+    }
+    lanes
+}
+
+/// Three rows of lanes.
+#[inline(always)]
+pub(super) fn each3<T>(row: impl Fn(usize) -> T) -> [T; 3] {
+    [row(0), row(1), row(2)]
+}
+
 /// `a · b` in each lane.
 #[inline(always)]
 pub(super) fn times<T: Real>(a: &Lanes<T>, b: &Lanes<T>) -> Lanes<T> {
-    std::array::from_fn(|l| a[l] * b[l])
+    each(
+        #[inline(always)]
+        |l| a[l] * b[l],
+    )
 }
 
 /// `a · b + c` in each lane, rounded once.
 #[inline(always)]
 pub(super) fn fused<T: Real>(a: &Lanes<T>, b: &Lanes<T>, c: &Lanes<T>) -> Lanes<T> {
-    std::array::from_fn(|l| a[l].mul_add(b[l], c[l]))
+    each(
+        #[inline(always)]
+        |l| a[l].mul_add(b[l], c[l]),
+    )
+}
+
+/// `a + b` in each lane.
+#[inline(always)]
+pub(super) fn plus<T: Real>(a: &Lanes<T>, b: &Lanes<T>) -> Lanes<T> {
+    each(
+        #[inline(always)]
+        |l| a[l] + b[l],
+    )
 }
 
 /// `a − b` in each lane.
 #[inline(always)]
 pub(super) fn minus<T: Real>(a: &Lanes<T>, b: &Lanes<T>) -> Lanes<T> {
-    std::array::from_fn(|l| a[l] - b[l])
+    each(
+        #[inline(always)]
+        |l| a[l] - b[l],
+    )
 }
 
 /// The sum of the lanes, always in the same order, in `f64`.
 #[inline(always)]
 pub(super) fn sum<T: Real>(a: &Lanes<T>) -> f64 {
-    let half: [f64; 4] = std::array::from_fn(|l| a[l].to_f64() + a[l + 4].to_f64());
+    let mut half = [0.0; 4];
+    for (l, half) in half.iter_mut().enumerate() {
+        *half = a[l].to_f64() + a[l + 4].to_f64();
+    }
     (half[0] + half[2]) + (half[1] + half[3])
 }
 

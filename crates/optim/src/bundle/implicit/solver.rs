@@ -3,36 +3,78 @@
 use std::sync::Arc;
 
 use nalgebra::{SVector, Vector3};
+use terrane_geometry::{Camera, Rigid3};
 
-use super::super::explicit::unconstrained;
 use super::super::layout::{Cameras, NONE};
-use super::super::levenberg_marquardt::{Backend, Linearised};
-use super::super::plan::Dropped;
+use super::super::levenberg_marquardt::{Backend, Linearised, minimise};
 use super::super::reduced::prior_cost;
 use super::super::step::Tried;
-use super::super::{BundleError, BundleOptions, BundleProblem, BundleReport, Preconditioner, Shards};
-use super::clusters::{Parted, Views, make_parts};
+use super::super::{
+    BundleError, BundleOptions, BundleProblem, BundleReport, BundleSolver, Preconditioner, Shards,
+};
 use super::conjugate_gradients;
 use super::host::{LocalHost, PartHost};
 use super::local::cluster_indices;
+use super::partition::{Partition, partition};
 use super::preconditioner::{BlockFactors, Coarse, Extra, Inverse, PosePrior};
 use super::priors::{PriorRow, prior_rows};
 use super::state::packed;
 use super::system::{CameraSystem, Preconditioned};
 use super::worker::{CameraSide, PartRequest, PartWorker};
 
-/// A problem whose parts are held by somebody.
-pub(in super::super) struct Implicit<'a> {
-    shards: &'a dyn Shards,
-    origins: Vec<Vec<(u32, u32)>>,
-    driver: Driver,
-    free_points: bool,
+/// Solves a problem that was cut by [`super::partition`], whoever holds the parts; `poses` are those of each part. Begins
+/// with the report of the partition. The adjusted poses and intrinsics come back; points stay with the holders.
+///
+/// # Errors
+/// When the options do not fit the problem, or a part can't be reached.
+pub fn solve_parts(
+    side: Arc<CameraSide>,
+    host: &mut dyn PartHost,
+    poses: Vec<Vec<u32>>,
+    report: &mut BundleReport,
+) -> Result<(Vec<Rigid3>, Vec<Camera>), BundleError> {
+    let any = report.observations > 0 || !side.problem.position_priors.is_empty();
+    let anything = any && (side.map.num_unknowns > 0 || report.points > 0);
+    let mut driver = Driver::new(side.clone(), host, poses)?;
+    report.solver = BundleSolver::Implicit;
+    report.termination = minimise(&mut driver, &side.options, anything, report)?;
+    report.linear_iterations = driver.linear_iterations;
+    Ok((driver.cameras.poses, driver.cameras.intrinsics))
+}
+
+/// Solves a problem with all parts in this process; the adjusted cameras, and the points of each shard.
+pub(in super::super) fn solve_here(
+    problem: &BundleProblem,
+    shards: &dyn Shards,
+    options: &BundleOptions,
+    report: &mut BundleReport,
+) -> Result<(Cameras, Vec<Vec<Vector3<f64>>>), BundleError> {
+    let Partition { side, parts, origins, report: found } = partition(problem, shards, options)?;
+    *report = found;
+    let side = Arc::new(side);
+    let poses = parts.iter().map(|part| part.poses.clone()).collect();
+    let mut worker = PartWorker::new(side.clone(), None, u64::MAX);
+    for (index, part) in parts.into_iter().enumerate() {
+        worker.take(index as u32, part)?;
+    }
+    let mut host = LocalHost(worker);
+    let (poses, intrinsics) = solve_parts(side, &mut host, poses, report)?;
+    let mut points = Vec::with_capacity(shards.len());
+    for index in 0..shards.len() {
+        points.push(shards.load(index)?.points.clone());
+    }
+    for (origins, answer) in origins.iter().zip(host.ask(&PartRequest::Points)?) {
+        for ((shard, point), x) in origins.iter().zip(answer.as_chunks::<3>().0) {
+            points[*shard as usize][*point as usize] = Vector3::from(*x);
+        }
+    }
+    Ok((Cameras::new(poses, intrinsics), points))
 }
 
 /// The camera side, whoever holds the parts.
-pub(super) struct Driver {
+struct Driver<'a> {
     side: Arc<CameraSide>,
-    host: Box<dyn PartHost>,
+    host: &'a mut dyn PartHost,
     /// The poses of each part.
     poses: Vec<Vec<u32>>,
     cameras: Cameras,
@@ -63,95 +105,10 @@ struct Sums {
     steepest: f64,
 }
 
-impl<'a> Implicit<'a> {
-    /// Reads every shard twice: what takes part and what sees what, then the parts.
-    pub fn prepare(
-        problem: &BundleProblem,
-        shards: &'a dyn Shards,
-        options: &BundleOptions,
-        report: &mut BundleReport,
-    ) -> Result<Self, BundleError> {
-        let cameras = Cameras::new(problem.poses.clone(), problem.intrinsics.clone());
-        let num_poses = problem.poses.len();
-        let mut views = Views::new(num_poses);
-        let mut dropped = Vec::with_capacity(shards.len());
-        for index in 0..shards.len() {
-            let shard = shards.load(index)?;
-            shard.validate(index, num_poses)?;
-            let out = Dropped::find(&shard, problem, &cameras);
-            let mut skip = out.observations.iter().copied().peekable();
-            let mut last = None;
-            for (i, o) in shard.observations.iter().enumerate() {
-                if skip.next_if_eq(&(i as u32)).is_none() {
-                    views.add(o.pose, &shard.points[o.point as usize]);
-                    report.observations += 1;
-                    report.points += u64::from(last != Some(o.point));
-                    last = Some(o.point);
-                }
-            }
-            report.behind_camera += out.behind_camera;
-            report.seen_once += out.seen_once;
-            dropped.push(out);
-        }
-        let clusters = views.cluster(problem);
-        let Parted { parts, origins } = make_parts(shards, &dropped, &clusters)?;
-        let free_points = parts.iter().any(|part| part.first_fixed_point > 0);
-        let side = CameraSide::new(problem.clone(), options.clone(), &views.observed(), clusters);
-        report.unconstrained_poses = unconstrained(problem, &side.layout, None);
-        report.reduced_unknowns = side.map.num_unknowns as u64;
-        let side = Arc::new(side);
-        let poses = parts.iter().map(|part| part.poses.clone()).collect();
-        let numbered = parts.into_iter().enumerate().map(|(index, part)| (index as u32, part)).collect();
-        let host = Box::new(LocalHost(PartWorker::new(side.clone(), numbered)?));
-        Ok(Self { shards, origins, driver: Driver::new(side, host, poses)?, free_points })
-    }
-
-    /// Whether any parameter may move and anything says where to.
-    pub fn anything_to_adjust(&self, report: &BundleReport) -> bool {
-        let side = &self.driver.side;
-        let any = report.observations > 0 || !side.problem.position_priors.is_empty();
-        any && (side.map.num_unknowns > 0 || self.free_points)
-    }
-
-    /// Iterations of conjugate gradients so far.
-    pub fn linear_iterations(&self) -> u64 {
-        self.driver.linear_iterations
-    }
-
-    /// The accepted cameras, and the accepted points of each shard.
-    pub fn into_result(mut self) -> Result<(Cameras, Vec<Vec<Vector3<f64>>>), BundleError> {
-        let mut points = Vec::with_capacity(self.shards.len());
-        for index in 0..self.shards.len() {
-            points.push(self.shards.load(index)?.points.clone());
-        }
-        let answers = self.driver.host.ask(&PartRequest::Points)?;
-        for (origins, answer) in self.origins.iter().zip(&answers) {
-            for ((shard, point), x) in origins.iter().zip(answer.as_chunks::<3>().0) {
-                points[*shard as usize][*point as usize] = Vector3::from(*x);
-            }
-        }
-        Ok((self.driver.cameras, points))
-    }
-}
-
-impl Backend for Implicit<'_> {
-    fn linearise(&mut self, damping: f64, anew: bool) -> Result<Linearised, BundleError> {
-        self.driver.linearise(damping, anew)
-    }
-
-    fn try_step(&mut self, damping: f64) -> Result<Option<Tried>, BundleError> {
-        self.driver.try_step(damping)
-    }
-
-    fn accept(&mut self) -> Result<(), BundleError> {
-        self.driver.accept()
-    }
-}
-
-impl Driver {
-    pub fn new(
+impl<'a> Driver<'a> {
+    fn new(
         side: Arc<CameraSide>,
-        host: Box<dyn PartHost>,
+        host: &'a mut dyn PartHost,
         poses: Vec<Vec<u32>>,
     ) -> Result<Self, BundleError> {
         let kind = match side.options.preconditioner {
@@ -160,7 +117,8 @@ impl Driver {
         };
         if kind == Preconditioner::PowerSeries && !side.map.shared.is_empty() {
             return Err(BundleError::invalid(
-                "the power series needs intrinsics that no two poses share: hold them, or choose two-level".to_owned(),
+                "the power series needs intrinsics that no two poses share: hold them, or choose two-level"
+                    .to_owned(),
             ));
         }
         let cameras = Cameras::new(side.problem.poses.clone(), side.problem.intrinsics.clone());
@@ -179,22 +137,16 @@ impl Driver {
         };
         let factors = BlockFactors::new(&side, &[], &[], false);
         let inverse = Inverse { kind, factors, coarse, cluster_indices };
-        Ok(Self { side, host, poses, cameras, next: None, sums: Sums::default(), inverse, linear_iterations: 0 })
-    }
-
-    fn linearise(&mut self, damping: f64, anew: bool) -> Result<Linearised, BundleError> {
-        let answers = self.host.ask(&PartRequest::Linearise { damping, anew })?;
-        let mut cost = self.gather(&answers);
-        self.add_priors();
-        cost += prior_cost(&self.side.problem, &self.side.layout, &self.cameras, &self.side.options);
-        let tiny = f64::MIN_POSITIVE.sqrt();
-        for d in &mut self.sums.diagonal {
-            // A parameter without any effect stays where it is.
-            *d = d.max(tiny);
-        }
-        self.sums.damping = self.sums.diagonal.iter().map(|d| (damping * d).max(tiny)).collect();
-        let slopes = self.sums.descent.iter().zip(&self.sums.diagonal).map(|(g, d)| g * g / d);
-        Ok(Linearised { cost, steepest: slopes.fold(self.sums.steepest, f64::max) })
+        Ok(Self {
+            side,
+            host,
+            poses,
+            cameras,
+            next: None,
+            sums: Sums::default(),
+            inverse,
+            linear_iterations: 0,
+        })
     }
 
     /// Adds up what parts answered to [`PartRequest::Linearise`]; the cost.
@@ -288,6 +240,23 @@ impl Driver {
         }
         Ok(())
     }
+}
+
+impl Backend for Driver<'_> {
+    fn linearise(&mut self, damping: f64, anew: bool) -> Result<Linearised, BundleError> {
+        let answers = self.host.ask(&PartRequest::Linearise { damping, anew })?;
+        let mut cost = self.gather(&answers);
+        self.add_priors();
+        cost += prior_cost(&self.side.problem, &self.side.layout, &self.cameras, &self.side.options);
+        let tiny = f64::MIN_POSITIVE.sqrt();
+        for d in &mut self.sums.diagonal {
+            // A parameter without any effect stays where it is.
+            *d = d.max(tiny);
+        }
+        self.sums.damping = self.sums.diagonal.iter().map(|d| (damping * d).max(tiny)).collect();
+        let slopes = self.sums.descent.iter().zip(&self.sums.diagonal).map(|(g, d)| g * g / d);
+        Ok(Linearised { cost, steepest: slopes.fold(self.sums.steepest, f64::max) })
+    }
 
     fn try_step(&mut self, damping: f64) -> Result<Option<Tried>, BundleError> {
         self.prepare()?;
@@ -296,7 +265,7 @@ impl Driver {
             let Self { host, poses, sums, inverse, .. } = self;
             let system = CameraSystem {
                 side: &side,
-                host: host.as_mut(),
+                host: &mut **host,
                 poses,
                 damping: &sums.damping,
                 priors: &sums.priors,
@@ -339,6 +308,10 @@ impl Driver {
         if let Some(next) = self.next.take() {
             self.host.ask(&PartRequest::Accept)?;
             self.cameras = next;
+            if self.host.wants_cameras() {
+                let numbers = self.side.flatten(&self.cameras);
+                self.host.accepted(numbers);
+            }
         }
         Ok(())
     }
@@ -351,7 +324,9 @@ fn shared_blocks(side: &CameraSide, blocks: &[f64], damping: &[f64], priors: &[P
         side.map.shared.iter().map(|(_, n)| vec![0.0; packed(*n as usize)]).collect();
     let find = |first: u32| side.map.shared.binary_search_by_key(&first, |(first, _)| *first).ok();
     for (unknowns, block) in side.map.of_pose.iter().zip(blocks.chunks_exact(packed(width))) {
-        let Some(at) = (unknowns.num_intrinsics > 0).then(|| find(unknowns.intrinsics)).flatten() else { continue };
+        let Some(at) = (unknowns.num_intrinsics > 0).then(|| find(unknowns.intrinsics)).flatten() else {
+            continue;
+        };
         for a in 0..unknowns.num_intrinsics as usize {
             for b in 0..=a {
                 shared[at][packed(a) + b] += block[packed(6 + a) + 6 + b];

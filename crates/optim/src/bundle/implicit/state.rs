@@ -28,26 +28,23 @@ pub(super) struct PartState<T> {
     pub lanes: LaneArrays<T>,
     /// Of each point the normal equations (lower triangle by rows) and the gradient, before damping.
     pub normal: Vec<[f64; 9]>,
-    /// `L⁻¹ g` and the diagonal of each point.
-    pub reduced: Vec<[f64; 6]>,
+    /// `L⁻¹ g` of each point.
+    pub reduced: Vec<[f64; 3]>,
+    /// The gradient, `6 + stride` for each camera.
+    pub gradient: Vec<f64>,
+    pub cost: f64,
     pub scratch: Scratch<T>,
     pub local: Option<LocalFactor<T>>,
-    pub sums: CameraSums,
 }
 
 /// Sums over the observations of each camera of a part, `6 + stride` wide; blocks are packed lower triangles by rows.
-#[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct CameraSums {
-    /// The gradient.
-    pub gradient: Vec<f64>,
     /// The gradient after elimination.
     pub reduced_gradient: Vec<f64>,
     /// The normal equations, one block a camera.
     pub normal: Vec<f64>,
     /// The diagonal blocks of the reduced system.
     pub reduced: Vec<f64>,
-    /// Cost, where it was linearised.
-    pub cost: f64,
     /// The largest `g² / D` of a point's coordinate.
     pub steepest: f64,
 }
@@ -59,18 +56,43 @@ pub(super) const fn packed(width: usize) -> usize {
 
 impl<T: Real> PartState<T> {
     pub fn new(part: Part, stride: usize) -> Self {
-        let lanes = lane_arrays(&part, stride);
-        let n = part.points.len();
-        Self {
-            tried: part.points.clone(),
-            lanes,
-            normal: vec![[0.0; 9]; n],
-            reduced: vec![[0.0; 6]; n],
+        let mut state = Self {
+            part: Part::default(),
+            tried: Vec::new(),
+            lanes: LaneArrays::default(),
+            normal: Vec::new(),
+            reduced: Vec::new(),
+            gradient: Vec::new(),
+            cost: 0.0,
             scratch: Scratch::default(),
             local: None,
-            sums: CameraSums::default(),
-            part,
-        }
+        };
+        state.refill(part, stride);
+        state
+    }
+
+    /// Takes a part in again after [`PartState::release`].
+    pub fn refill(&mut self, part: Part, stride: usize) {
+        let n = part.points.len();
+        self.lanes = lane_arrays(&part, stride);
+        self.tried = part.points.clone();
+        self.normal = vec![[0.0; 9]; n];
+        self.reduced = vec![[0.0; 3]; n];
+        self.part = part;
+    }
+
+    /// Gives everything back but the cluster's factor.
+    pub fn release(&mut self) {
+        let local = self.local.take();
+        *self = Self { local, ..Self::new(Part::default(), 0) };
+    }
+
+    /// Bytes that a part takes when it is held, beside its cluster's factor.
+    pub fn held_bytes(part: &Part, stride: usize) -> u64 {
+        let lanes = part.num_observations() + LANES / 2 * part.poses.len();
+        let observation = num_rows(stride) * size_of::<T>() + 2 * size_of::<T>() + 4;
+        let point = 2 * size_of::<Vector3<f64>>() + 9 * 8 + 3 * 8 + 10 * size_of::<T>();
+        (lanes * observation + 12 * part.num_observations() + point * part.points.len()) as u64
     }
 
     /// Residuals and Jacobians of all observations, at the accepted points.
@@ -79,15 +101,14 @@ impl<T: Real> PartState<T> {
         let num_cameras = self.part.poses.len();
         self.normal.fill([0.0; 9]);
         self.lanes.rows.fill(splat(T::default()));
-        let sums = &mut self.sums;
-        sums.cost = 0.0;
-        sums.gradient.clear();
-        sums.gradient.resize(width * num_cameras, 0.0);
+        self.cost = 0.0;
+        self.gradient.clear();
+        self.gradient.resize(width * num_cameras, 0.0);
         for camera in 0..num_cameras {
             let pose = self.part.poses[camera] as usize;
             let rotation = &frame.cameras.rotations[pose];
             self.lanes.rotations[camera] = std::array::from_fn(|i| T::from_f64(rotation[i / 3][i % 3]));
-            let gradient = &mut self.sums.gradient[width * camera..width * (camera + 1)];
+            let gradient = &mut self.gradient[width * camera..width * (camera + 1)];
             let first = self.part.first_observation[camera] as usize;
             let end = self.part.first_observation[camera + 1] as usize;
             for i in first..end {
@@ -97,14 +118,13 @@ impl<T: Real> PartState<T> {
                 let rows = &mut self.lanes.rows[num_rows(frame.map.stride) * (slot / LANES)..];
                 let normal = &mut self.normal[point];
                 let seen = Seen { pose, xy_px: self.part.xy_px[i], lane: slot % LANES };
-                self.sums.cost += linearise(frame, &seen, x, rows, normal, gradient);
+                self.cost += linearise(frame, &seen, x, rows, normal, gradient);
             }
         }
-        self.sums.normal = self.lanes.normal_blocks(frame.map.stride);
     }
 
-    /// Eliminates the points with this damping.
-    pub fn eliminate(&mut self, damping: f64, stride: usize) {
+    /// Eliminates the points with this damping; the largest `g² / D` of a point's coordinate.
+    pub fn eliminate(&mut self, damping: f64) -> f64 {
         let mut steepest = 0.0f64;
         for (point, normal) in self.normal.iter().enumerate() {
             let free = point < self.part.first_fixed_point as usize;
@@ -116,15 +136,18 @@ impl<T: Real> PartState<T> {
                 Default::default()
             };
             self.lanes.inverse[point] = terms.inverse.map(T::from_f64);
-            let (r, d) = (terms.reduced, terms.diagonal);
-            self.reduced[point] = [r[0], r[1], r[2], d[0], d[1], d[2]];
+            self.reduced[point] = terms.reduced;
             steepest = steepest.max(slope);
         }
-        self.sums.steepest = steepest;
-        let sums = &mut self.sums;
-        sums.reduced.clone_from(&sums.normal);
-        sums.reduced_gradient.clone_from(&sums.gradient);
-        self.lanes.eliminate(stride, &self.reduced, &mut sums.reduced, &mut sums.reduced_gradient);
+        steepest
+    }
+
+    /// What remains of the cameras' blocks and gradients after [`PartState::eliminate`].
+    pub fn camera_sums(&self, stride: usize, steepest: f64) -> CameraSums {
+        let normal = self.lanes.normal_blocks(stride);
+        let (mut reduced, mut reduced_gradient) = (normal.clone(), self.gradient.clone());
+        self.lanes.eliminate(stride, &self.reduced, &mut reduced, &mut reduced_gradient);
+        CameraSums { reduced_gradient, normal, reduced, steepest }
     }
 }
 

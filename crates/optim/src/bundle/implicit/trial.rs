@@ -27,8 +27,8 @@ impl<T: Real> PartState<T> {
         }
         let mut lost = Vec::new();
         for (camera, pose) in self.part.poses.iter().enumerate() {
-            let observations =
-                self.part.first_observation[camera] as usize..self.part.first_observation[camera + 1] as usize;
+            let observations = self.part.first_observation[camera] as usize
+                ..self.part.first_observation[camera + 1] as usize;
             for i in observations {
                 let point = self.part.point_of[i];
                 match cost(frame, next, *pose as usize, &self.tried[point as usize], self.part.xy_px[i]) {
@@ -48,7 +48,9 @@ impl<T: Real> PartState<T> {
     /// `δp = −L⁻ᵀ (L⁻¹ g + L⁻¹ w)`, and what it adds to the model.
     fn point_step(&self, point: usize, asked: &[f64; 3], damping: f64, tried: &mut Tried) -> Vector3<f64> {
         let i = self.lanes.inverse[point].map(|v| v.to_f64());
-        let [r0, r1, r2, diagonal @ ..] = self.reduced[point];
+        let (normal, [r0, r1, r2]) = (&self.normal[point], self.reduced[point]);
+        let held = self.lanes.inverse[point] == [T::default(); 6];
+        let diagonal = if held { [0.0; 3] } else { [normal[0], normal[2], normal[5]] };
         let right = [
             r0 + i[0] * asked[0],
             r1 + i[1] * asked[0] + i[2] * asked[1],
@@ -69,7 +71,14 @@ impl<T: Real> PartState<T> {
     }
 
     /// Shortens the steps of points that leave the view of a camera, and corrects the cost.
-    fn shorten(&mut self, frame: &Frame<'_>, next: &Cameras, steps: &[Vector3<f64>], lost: &[u32], tried: &mut Tried) {
+    fn shorten(
+        &mut self,
+        frame: &Frame<'_>,
+        next: &Cameras,
+        steps: &[Vector3<f64>],
+        lost: &[u32],
+        tried: &mut Tried,
+    ) {
         let mut seen: Vec<Vec<(u32, [f32; 2])>> = vec![Vec::new(); lost.len()];
         for (camera, pose) in self.part.poses.iter().enumerate() {
             for i in self.part.first_observation[camera]..self.part.first_observation[camera + 1] {
@@ -80,14 +89,18 @@ impl<T: Real> PartState<T> {
         }
         for (point, seen) in lost.iter().map(|point| *point as usize).zip(&seen) {
             // What was counted of this point before it was known to be lost.
-            let counted = seen.iter().filter_map(|(pose, xy)| cost(frame, next, *pose as usize, &self.tried[point], *xy));
+            let counted = seen
+                .iter()
+                .filter_map(|(pose, xy)| cost(frame, next, *pose as usize, &self.tried[point], *xy));
             tried.cost -= counted.sum::<f64>();
             let whole = |x: &Vector3<f64>| {
                 seen.iter().map(|(pose, xy)| cost(frame, next, *pose as usize, x, *xy)).sum::<Option<f64>>()
             };
             let start = self.part.points[point];
-            let lengths = (1..=MAX_HALVINGS + 1).map(|i| if i > MAX_HALVINGS { 0.0 } else { 0.5f64.powi(i as i32) });
-            let found = lengths.map(|length| start + steps[point] * length).find_map(|x| Some((x, whole(&x)?)));
+            let lengths =
+                (1..=MAX_HALVINGS + 1).map(|i| if i > MAX_HALVINGS { 0.0 } else { 0.5f64.powi(i as i32) });
+            let found =
+                lengths.map(|length| start + steps[point] * length).find_map(|x| Some((x, whole(&x)?)));
             let (x, cost) = found.unwrap_or((start, f64::INFINITY));
             self.tried[point] = x;
             tried.cost += cost;

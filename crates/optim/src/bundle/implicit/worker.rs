@@ -1,10 +1,13 @@
 //! Holding parts and answering for them: the same on this machine's threads and behind a network.
 
+use std::sync::Arc;
+
+use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::super::layout::{Cameras, Layout};
 use super::super::step::Tried;
-use super::super::{BundleError, BundleOptions, BundleProblem, Precision};
+use super::super::{BundleError, BundleOptions, BundleProblem, Precision, ShardError};
 use super::clusters::Clusters;
 use super::coarse::{CoarseGroups, middles};
 use super::part::{CameraMap, Part};
@@ -49,6 +52,7 @@ pub enum PartRequest {
 pub struct CameraSide {
     pub(super) problem: BundleProblem,
     pub(super) options: BundleOptions,
+    pub(super) observed: Vec<bool>,
     pub(super) layout: Layout,
     pub(super) map: CameraMap,
     pub(super) clusters: Clusters,
@@ -57,11 +61,70 @@ pub struct CameraSide {
 
 impl CameraSide {
     /// The unknowns of a problem of which the poses in `observed` see points.
-    pub fn new(problem: BundleProblem, options: BundleOptions, observed: &[bool], clusters: Clusters) -> Self {
-        let layout = Layout::new(&problem, observed, None);
-        let map = CameraMap::new(&problem, &layout, observed);
+    pub fn new(
+        problem: BundleProblem,
+        options: BundleOptions,
+        observed: Vec<bool>,
+        clusters: Clusters,
+    ) -> Self {
+        let layout = Layout::new(&problem, &observed, None);
+        let map = CameraMap::new(&problem, &layout, &observed);
         let coarse = CoarseGroups { num_clusters: clusters.count, shared: map.shared.clone() };
-        Self { problem, options, layout, map, clusters, coarse }
+        Self { problem, options, observed, layout, map, clusters, coarse }
+    }
+
+    /// The cameras at the start.
+    pub fn problem(&self) -> &BundleProblem {
+        &self.problem
+    }
+
+    /// The options of the solve.
+    pub fn options(&self) -> &BundleOptions {
+        &self.options
+    }
+
+    /// Whether each pose sees any point.
+    pub fn observed(&self) -> &[bool] {
+        &self.observed
+    }
+
+    /// The clusters of poses.
+    pub fn clusters(&self) -> &Clusters {
+        &self.clusters
+    }
+
+    /// Cameras as numbers: seven of each pose, then the parameters of each of the intrinsics.
+    pub(super) fn flatten(&self, cameras: &Cameras) -> Vec<f64> {
+        let poses = cameras.poses.iter().flat_map(|pose| {
+            let (q, t) = (pose.rotation.coords, pose.translation);
+            [q.x, q.y, q.z, q.w, t.x, t.y, t.z]
+        });
+        let intrinsics = cameras.intrinsics.iter().flat_map(|camera| camera.params().iter().copied());
+        poses.chain(intrinsics).collect()
+    }
+
+    /// The way back from [`CameraSide::flatten`].
+    pub(super) fn unflatten(&self, numbers: &[f64]) -> Result<Cameras, BundleError> {
+        let (mut poses, mut intrinsics) = (self.problem.poses.clone(), self.problem.intrinsics.clone());
+        let params: usize = intrinsics.iter().map(|camera| camera.params().len()).sum();
+        if numbers.len() != 7 * poses.len() + params {
+            return Err(BundleError::invalid(
+                "the cameras to go on from are those of another problem".to_owned(),
+            ));
+        }
+        let (of_poses, mut rest) = numbers.split_at(7 * poses.len());
+        for (pose, v) in poses.iter_mut().zip(of_poses.as_chunks::<7>().0) {
+            // As it was, to the last bit: not normalised again.
+            let quaternion = nalgebra::Quaternion::new(v[3], v[0], v[1], v[2]);
+            pose.rotation = nalgebra::UnitQuaternion::new_unchecked(quaternion);
+            pose.translation = Vector3::new(v[4], v[5], v[6]);
+        }
+        for camera in &mut intrinsics {
+            let (own, after) = rest.split_at(camera.params().len());
+            camera.params_mut().copy_from_slice(own);
+            rest = after;
+        }
+        Ok(Cameras::new(poses, intrinsics))
     }
 
     pub(super) fn frame<'a>(&'a self, cameras: &'a Cameras) -> Frame<'a> {
@@ -76,75 +139,210 @@ impl CameraSide {
     }
 }
 
+/// Where parts lie that are not held, and where steps are kept so that a lost holder's parts can be taken over.
+pub trait PartStore: Send + Sync {
+    /// A part as it was at the start.
+    ///
+    /// # Errors
+    /// When it can't be read.
+    fn load(&self, part: u32) -> Result<Part, ShardError>;
+
+    /// The points of a part after a number of accepted steps, at least one.
+    ///
+    /// # Errors
+    /// When they can't be read.
+    fn load_points(&self, part: u32, step: u64) -> Result<Vec<Vector3<f64>>, ShardError>;
+
+    /// Keeps the points of a part for a step that is being tried; the accepted one and this one are needed.
+    ///
+    /// # Errors
+    /// When they can't be written.
+    fn store_points(&self, part: u32, step: u64, points: &[Vector3<f64>]) -> Result<(), ShardError>;
+}
+
 /// Holds parts and answers for them.
 pub struct PartWorker {
-    side: std::sync::Arc<CameraSide>,
+    side: Arc<CameraSide>,
     cameras: Cameras,
     next: Option<Cameras>,
-    parts: Vec<(u32, Box<dyn Answer>)>,
+    /// Accepted steps so far.
+    step: u64,
+    damping: f64,
+    parts: Vec<Held>,
+    store: Option<Arc<dyn PartStore>>,
+    /// Memory for parts that is not taken yet.
+    memory_bytes: u64,
+}
+
+struct Held {
+    index: u32,
+    state: Box<dyn Answer>,
+    /// Whether it stays in memory between requests.
+    resident: bool,
 }
 
 impl PartWorker {
-    /// Takes parts, numbered by cluster; they begin at the problem's cameras and their own points.
-    ///
-    /// # Errors
-    /// When a part is not valid.
-    pub fn new(side: std::sync::Arc<CameraSide>, parts: Vec<(u32, Part)>) -> Result<Self, BundleError> {
+    /// Nothing held yet. `memory_bytes` is for held parts; with a store, parts beyond it are read again for each request.
+    pub fn new(side: Arc<CameraSide>, store: Option<Arc<dyn PartStore>>, memory_bytes: u64) -> Self {
         let cameras = Cameras::new(side.problem.poses.clone(), side.problem.intrinsics.clone());
-        let mut worker = Self { side, cameras, next: None, parts: Vec::new() };
-        for (index, part) in parts {
-            worker.add(index, part)?;
-        }
-        Ok(worker)
+        Self { side, cameras, next: None, step: 0, damping: 0.0, parts: Vec::new(), store, memory_bytes }
     }
 
-    fn add(&mut self, index: u32, part: Part) -> Result<(), BundleError> {
-        part.validate(index as usize, self.side.problem.poses.len())?;
-        let stride = self.side.map.stride;
-        let state: Box<dyn Answer> = match self.side.options.precision {
-            Precision::Single => Box::new(PartState::<f32>::new(part, stride)),
-            Precision::Double => Box::new(PartState::<f64>::new(part, stride)),
-        };
-        self.parts.push((index, state));
+    /// Moves to the accepted cameras of another solver, in the form of [`CameraSide::flatten`].
+    ///
+    /// # Errors
+    /// When there are not as many numbers as that.
+    pub fn resume(&mut self, step: u64, cameras: &[f64]) -> Result<(), BundleError> {
+        self.cameras = self.side.unflatten(cameras)?;
+        (self.step, self.next) = (step, None);
         Ok(())
     }
 
-    /// Answers for every part, in the order in which they were taken. What the numbers are depends on the request.
-    pub fn answer(&mut self, request: &PartRequest) -> Vec<(u32, Vec<f64>)> {
+    /// Takes a part over, from memory.
+    ///
+    /// # Errors
+    /// When the part is not valid.
+    pub fn take(&mut self, index: u32, part: Part) -> Result<(), BundleError> {
+        part.validate(index as usize, self.side.problem.poses.len())?;
+        let stride = self.side.map.stride;
+        let double = self.side.options.precision == Precision::Double;
+        let bytes = if double {
+            PartState::<f64>::held_bytes(&part, stride)
+        } else {
+            PartState::<f32>::held_bytes(&part, stride)
+        };
+        let resident = self.store.is_none() || bytes <= self.memory_bytes;
+        self.memory_bytes -= if resident { bytes.min(self.memory_bytes) } else { 0 };
+        let part = if resident { part } else { Part::default() };
+        let state: Box<dyn Answer> = if double {
+            Box::new(PartState::<f64>::new(part, stride))
+        } else {
+            Box::new(PartState::<f32>::new(part, stride))
+        };
+        let at = self.parts.partition_point(|held| held.index < index);
+        self.parts.insert(at, Held { index, state, resident });
+        Ok(())
+    }
+
+    /// Takes a part over, from the store, at the accepted step.
+    ///
+    /// # Errors
+    /// When it can't be read or is not valid.
+    pub fn take_stored(&mut self, index: u32) -> Result<(), BundleError> {
+        let Some(store) = self.store.clone() else {
+            return Err(BundleError::invalid(format!("part {index} can't be taken over: there is no store")));
+        };
+        let part = stored_part(store.as_ref(), index, self.step)?;
+        self.take(index, part)
+    }
+
+    /// The parts that are held, ascending, and whether each stays in memory.
+    pub fn held(&self) -> impl Iterator<Item = (u32, bool)> + '_ {
+        self.parts.iter().map(|held| (held.index, held.resident))
+    }
+
+    /// Answers for every part, ascending, or only for those in `only`. What the numbers are depends on the request.
+    ///
+    /// # Errors
+    /// When a part can't be read or written.
+    pub fn answer(
+        &mut self,
+        request: &PartRequest,
+        only: Option<&[u32]>,
+    ) -> Result<Vec<(u32, Vec<f64>)>, BundleError> {
         match request {
             PartRequest::Accept => {
                 if let Some(next) = self.next.take() {
-                    self.cameras = next;
+                    (self.cameras, self.step) = (next, self.step + 1);
                 }
             }
             PartRequest::Try { step, .. } => self.next = self.cameras.stepped(&self.side.layout, step),
+            PartRequest::Linearise { damping, .. } => self.damping = *damping,
             _ => {}
         }
-        let frame = self.side.frame(&self.cameras);
         let middles = match request {
             PartRequest::Prepare { coarse: true, .. } => middles(&self.cameras, &self.side.clusters),
             _ => Vec::new(),
         };
         let context = AnswerContext {
-            frame,
+            frame: self.side.frame(&self.cameras),
             coarse: &self.side.coarse,
             middles: &middles,
             next: self.next.as_ref(),
+            damping: self.damping,
+            step: self.step,
+            store: self.store.as_deref(),
         };
-        self.parts.par_iter_mut().map(|(index, part)| (*index, part.answer(&context, *index, request))).collect()
+        let wanted = |held: &&mut Held| only.is_none_or(|only| only.contains(&held.index));
+        self.parts
+            .par_iter_mut()
+            .filter(wanted)
+            .map(|held| Ok((held.index, held.answer(&context, request)?)))
+            .collect()
     }
 }
 
 struct AnswerContext<'a> {
     frame: Frame<'a>,
     coarse: &'a CoarseGroups,
-    middles: &'a [nalgebra::Vector3<f64>],
+    middles: &'a [Vector3<f64>],
     next: Option<&'a Cameras>,
+    damping: f64,
+    step: u64,
+    store: Option<&'a dyn PartStore>,
+}
+
+fn stored_part(store: &dyn PartStore, index: u32, step: u64) -> Result<Part, BundleError> {
+    let mut part = store.load(index)?;
+    if step > 0 {
+        let points = store.load_points(index, step)?;
+        if points.len() != part.points.len() {
+            return Err(BundleError::invalid(format!("the points of part {index} changed during the solve")));
+        }
+        part.points = points;
+    }
+    Ok(part)
+}
+
+impl Held {
+    fn answer(
+        &mut self,
+        context: &AnswerContext<'_>,
+        request: &PartRequest,
+    ) -> Result<Vec<f64>, BundleError> {
+        let away = !self.resident && !matches!(request, PartRequest::Solve(_) | PartRequest::Accept);
+        if let (true, Some(store)) = (away, context.store) {
+            let part = stored_part(store, self.index, context.step)?;
+            part.validate(self.index as usize, context.frame.problem.poses.len())?;
+            let linearise = !matches!(request, PartRequest::Linearise { .. } | PartRequest::Points);
+            self.state.refill(part, context, linearise);
+        }
+        let answer = match request {
+            // Without memory of the last time, everything is new.
+            PartRequest::Linearise { damping, .. } if away => {
+                let request = PartRequest::Linearise { damping: *damping, anew: true };
+                self.state.answer(context, self.index, &request)
+            }
+            PartRequest::Accept if !self.resident => Vec::new(),
+            _ => self.state.answer(context, self.index, request),
+        };
+        if let (PartRequest::Try { .. }, Some(store)) = (request, context.store) {
+            // Before the step is answered for: who takes over later finds it.
+            store.store_points(self.index, context.step + 1, self.state.tried())?;
+        }
+        if away {
+            self.state.release();
+        }
+        Ok(answer)
+    }
 }
 
 /// A part of either precision.
 trait Answer: Send {
     fn answer(&mut self, context: &AnswerContext<'_>, index: u32, request: &PartRequest) -> Vec<f64>;
+    fn refill(&mut self, part: Part, context: &AnswerContext<'_>, linearise: bool);
+    fn release(&mut self);
+    fn tried(&self) -> &[Vector3<f64>];
 }
 
 impl<T: Real> Answer for PartState<T> {
@@ -155,10 +353,10 @@ impl<T: Real> Answer for PartState<T> {
                 if *anew {
                     self.linearise(frame);
                 }
-                self.eliminate(*damping, frame.map.stride);
-                let sums = &self.sums;
-                let arrays = [&sums.gradient, &sums.reduced_gradient, &sums.normal, &sums.reduced];
-                [sums.cost, sums.steepest].iter().chain(arrays.into_iter().flatten()).copied().collect()
+                let steepest = self.eliminate(*damping);
+                let sums = self.camera_sums(frame.map.stride, steepest);
+                let arrays = [&self.gradient, &sums.reduced_gradient, &sums.normal, &sums.reduced];
+                [self.cost, sums.steepest].iter().chain(arrays.into_iter().flatten()).copied().collect()
             }
             PartRequest::Prepare { diagonal, coarse } => {
                 if !diagonal.is_empty() {
@@ -189,6 +387,22 @@ impl<T: Real> Answer for PartState<T> {
             }
             PartRequest::Points => self.part.points.iter().flat_map(|x| [x.x, x.y, x.z]).collect(),
         }
+    }
+
+    fn refill(&mut self, part: Part, context: &AnswerContext<'_>, linearise: bool) {
+        self.refill(part, context.frame.map.stride);
+        if linearise {
+            self.linearise(&context.frame);
+            self.eliminate(context.damping);
+        }
+    }
+
+    fn release(&mut self) {
+        self.release();
+    }
+
+    fn tried(&self) -> &[Vector3<f64>] {
+        &self.tried
     }
 }
 
