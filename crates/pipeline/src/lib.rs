@@ -4,6 +4,7 @@
 //! artefact. Nothing else passes between tasks, so any process that shares the [`Store`] can run any of them.
 //! This crate knows no network, no processes and no clocks; see `docs/conventions.md` for frames and units.
 
+pub mod adjustment;
 mod config;
 mod error;
 mod execute;

@@ -39,7 +39,7 @@ impl Endpoint {
 
 /// Adds the token to every call.
 #[derive(Clone)]
-struct AddToken(Option<MetadataValue<Ascii>>);
+pub(crate) struct AddToken(Option<MetadataValue<Ascii>>);
 
 impl tonic::service::Interceptor for AddToken {
     fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Refused> {
@@ -48,6 +48,48 @@ impl tonic::service::Interceptor for AddToken {
         }
         Ok(request)
     }
+}
+
+/// A channel to an endpoint, and what lets us in. Without `call_timeout` a call may last for ever.
+pub(crate) async fn connect(
+    endpoint: &Endpoint,
+    call_timeout: Option<Duration>,
+) -> Result<(Channel, AddToken), ProtoError> {
+    let bad = |error: tonic::transport::Error| {
+        ProtoError::invalid(&endpoint.url, format_args!("{error}; give the coordinator as http://HOST:PORT"))
+    };
+    if !endpoint.url.starts_with("http://") {
+        return Err(ProtoError::invalid(&endpoint.url, "give the coordinator as http://HOST:PORT"));
+    }
+    let mut builder = Channel::from_shared(endpoint.url.clone())
+        .map_err(|error| {
+            ProtoError::invalid(
+                &endpoint.url,
+                format_args!("{error}; give the coordinator as http://HOST:PORT"),
+            )
+        })?
+        .user_agent(program())
+        .map_err(bad)?
+        .connect_timeout(endpoint.connect_timeout)
+        .tcp_nodelay(true)
+        .http2_keep_alive_interval(Duration::from_secs(10))
+        .keep_alive_timeout(Duration::from_secs(20));
+    if let Some(timeout) = call_timeout {
+        builder = builder.timeout(timeout);
+    }
+    let channel = builder.connect().await.map_err(|error| {
+        ProtoError::unreachable(format!("no coordinator answers at {}: {}", endpoint.url, root(&error)))
+    })?;
+    let token = match &endpoint.token {
+        Some(token) => {
+            let mut value = MetadataValue::try_from(format!("Bearer {}", token.secret()))
+                .map_err(|_| ProtoError::invalid("token", "holds characters that can't travel"))?;
+            value.set_sensitive(true);
+            Some(value)
+        }
+        None => None,
+    };
+    Ok((channel, AddToken(token)))
 }
 
 /// A connection to a coordinator, shared by its clones; reconnects by itself when it was lost.
@@ -62,48 +104,8 @@ impl Client {
     /// # Errors
     /// Unreachable when nobody answers, a version mismatch when there is none in common, invalid input for a bad URL.
     pub async fn connect(endpoint: &Endpoint) -> Result<Self, ProtoError> {
-        let bad = |error: tonic::transport::Error| {
-            ProtoError::invalid(
-                &endpoint.url,
-                format_args!("{error}; give the coordinator as http://HOST:PORT"),
-            )
-        };
-        if !endpoint.url.starts_with("http://") {
-            return Err(ProtoError::invalid(&endpoint.url, "give the coordinator as http://HOST:PORT"));
-        }
-        let channel = Channel::from_shared(endpoint.url.clone())
-            .map_err(|error| {
-                ProtoError::invalid(
-                    &endpoint.url,
-                    format_args!("{error}; give the coordinator as http://HOST:PORT"),
-                )
-            })?
-            .user_agent(program())
-            .map_err(bad)?
-            .connect_timeout(endpoint.connect_timeout)
-            .timeout(endpoint.call_timeout)
-            .tcp_nodelay(true)
-            .http2_keep_alive_interval(Duration::from_secs(10))
-            .keep_alive_timeout(Duration::from_secs(20))
-            .connect()
-            .await
-            .map_err(|error| {
-                ProtoError::unreachable(format!(
-                    "no coordinator answers at {}: {}",
-                    endpoint.url,
-                    root(&error)
-                ))
-            })?;
-        let token = match &endpoint.token {
-            Some(token) => {
-                let mut value = MetadataValue::try_from(format!("Bearer {}", token.secret()))
-                    .map_err(|_| ProtoError::invalid("token", "holds characters that can't travel"))?;
-                value.set_sensitive(true);
-                Some(value)
-            }
-            None => None,
-        };
-        let inner = CoordinatorClient::with_interceptor(channel, AddToken(token))
+        let (channel, token) = connect(endpoint, Some(endpoint.call_timeout)).await?;
+        let inner = CoordinatorClient::with_interceptor(channel, token)
             .max_decoding_message_size(limits::MESSAGE_BYTES)
             .max_encoding_message_size(limits::MESSAGE_BYTES);
         let client = Self { inner };

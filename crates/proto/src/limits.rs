@@ -18,3 +18,7 @@ pub const LEASES: usize = 4096;
 pub const ROWS: usize = 100_000;
 /// Threads and slots of a worker.
 pub const THREADS: u32 = 65_536;
+/// Bytes of one frame of a holder's message.
+pub const FRAME_BYTES: usize = 1 << 20;
+/// Bytes of a holder's message when its frames are put together.
+pub const HOLDER_MESSAGE_BYTES: usize = 1 << 30;

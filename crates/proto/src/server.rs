@@ -123,7 +123,7 @@ pub async fn serve<S: WorkerCalls + ClientCalls>(
         .map_err(|error| ProtoError::unreachable(format!("the coordinator's listener failed: {error}")))
 }
 
-fn admit(token: Option<&Token>, request: Request<()>) -> Result<Request<()>, Wire> {
+pub(crate) fn admit(token: Option<&Token>, request: Request<()>) -> Result<Request<()>, Wire> {
     let Some(token) = token else { return Ok(request) };
     let given = request.metadata().get("authorization").map(|value| value.as_bytes());
     match given.and_then(|value| value.strip_prefix(b"Bearer ")) {

@@ -27,8 +27,8 @@ impl SceneError {
         Self(Box::new(Inner::Unsupported(message.into())))
     }
 
-    /// A value that can't be written in the format asked for.
-    pub(crate) fn invalid(message: impl Into<String>) -> Self {
+    /// A value that can't be written in the format asked for, or that contradicts itself.
+    pub fn invalid(message: impl Into<String>) -> Self {
         Self(Box::new(Inner::Invalid(message.into())))
     }
 

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-const HEADER: &str = "//! Generated from proto/terrane/v1/coordinator.proto by `cargo run -p terrane-xtask -- generate`: do not edit.\n";
-const PROTO: &str = "terrane/v1/coordinator.proto";
+const HEADER: &str = "//! Generated from proto/terrane/v1 by `cargo run -p terrane-xtask -- generate`: do not edit.\n";
+const PROTOS: [&str; 2] = ["terrane/v1/coordinator.proto", "terrane/v1/adjuster.proto"];
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
@@ -20,7 +20,7 @@ fn render() -> anyhow::Result<String> {
     let files = protox::Compiler::new([root().join("proto")])?
         .include_source_info(true)
         .include_imports(true)
-        .open_files([PROTO])?
+        .open_files(PROTOS)?
         .file_descriptor_set();
     let out = tempfile::tempdir().context("a temporary folder")?;
     tonic_prost_build::configure().bytes(".").out_dir(out.path()).compile_fds(files)?;

@@ -42,11 +42,18 @@ enum BundleErrorKind {
     Shard(#[from] ShardError),
     #[error("bundle adjustment: reduced camera system: {0}")]
     Linear(crate::linear::LinearError),
+    #[error("bundle adjustment: {0}")]
+    Lost(String),
 }
 
 impl BundleError {
     fn invalid(message: String) -> Self {
         BundleErrorKind::Invalid(message).into()
+    }
+
+    /// Nobody holds the parts of a problem any more; says why and what to do.
+    pub fn lost(message: String) -> Self {
+        BundleErrorKind::Lost(message).into()
     }
 
     /// Whether the problem or the options were wrong, rather than a shard's store or the machine's memory.

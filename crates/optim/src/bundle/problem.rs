@@ -1,12 +1,13 @@
 //! What a bundle adjustment adjusts: poses, intrinsics, and what is known of them beforehand.
 
 use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
 use terrane_geometry::{Camera, Rigid3};
 
 use super::BundleError;
 
 /// The camera side of a bundle adjustment. Points and observations come in shards ([`super::Shards`]).
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct BundleProblem {
     /// `cam_from_world` of each pose; refined on the left by `(ω, v)`.
     pub poses: Vec<Rigid3>,
@@ -25,7 +26,7 @@ pub struct BundleProblem {
 }
 
 /// Which parameters of a camera to refine.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RefineIntrinsics {
     /// The focal length or lengths.
     pub focal: bool,
@@ -61,7 +62,7 @@ impl RefineIntrinsics {
 }
 
 /// A measured camera centre.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PositionPrior {
     /// Index of the pose.
     pub pose: u32,
@@ -72,7 +73,7 @@ pub struct PositionPrior {
 }
 
 /// A focal length known beforehand; applies to each focal parameter of the intrinsics when focal length is refined.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FocalPrior {
     /// Index of the intrinsics.
     pub intrinsics: u32,

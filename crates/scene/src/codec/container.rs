@@ -55,6 +55,10 @@ pub enum Kind {
     Submap = 5,
     /// Cameras, points and tracks in one frame.
     Reconstruction = 6,
+    /// Points of one cluster of cameras with their observations, while they are adjusted.
+    AdjustmentPart = 7,
+    /// What the two ends of a distributed adjustment say to each other.
+    AdjustmentMessage = 8,
 }
 
 /// Names a kind of section: four bytes, readable in a hex dump.

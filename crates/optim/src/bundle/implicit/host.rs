@@ -11,7 +11,7 @@ pub trait PartHost {
     /// When a part can't be reached and nobody else can take it over.
     fn ask(&mut self, request: &PartRequest) -> Result<Vec<Vec<f64>>, BundleError>;
 
-    /// After a step was accepted: the cameras as numbers, from which a holder that joins later goes on.
+    /// Before [`PartRequest::Accept`]: the cameras that it accepts as numbers, from which a holder that joins later goes on.
     fn accepted(&mut self, cameras: Vec<f64>) {
         let _ = cameras;
     }
@@ -27,6 +27,7 @@ pub struct LocalHost(pub PartWorker);
 
 impl PartHost for LocalHost {
     fn ask(&mut self, request: &PartRequest) -> Result<Vec<Vec<f64>>, BundleError> {
+        self.0.begin(request);
         Ok(self.0.answer(request, None)?.into_iter().map(|(_, answer)| answer).collect())
     }
 }

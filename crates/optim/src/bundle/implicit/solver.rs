@@ -154,36 +154,38 @@ impl<'a> Driver<'a> {
         let (map, width) = (&self.side.map, self.side.map.width());
         let (n, num_poses) = (map.num_unknowns, map.of_pose.len());
         let sums = &mut self.sums;
+        let whole = self.inverse.kind == Preconditioner::PowerSeries;
         let (mut gradient, mut reduced_gradient) = (vec![0.0; n], vec![0.0; n]);
-        sums.normal = vec![0.0; packed(width) * num_poses];
+        sums.normal = vec![0.0; if whole { packed(width) * num_poses } else { 0 }];
         sums.reduced = vec![0.0; packed(width) * num_poses];
+        sums.diagonal = vec![0.0; n];
         sums.steepest = 0.0;
         let mut cost = 0.0;
         for (poses, answer) in self.poses.iter().zip(answers) {
             let [part_cost, steepest, rest @ ..] = answer.as_slice() else { continue };
             cost += part_cost;
             sums.steepest = sums.steepest.max(*steepest);
-            let (g, rest) = rest.split_at(width * poses.len());
-            let (reduced_g, rest) = rest.split_at(width * poses.len());
-            let (normal, reduced) = rest.split_at(packed(width) * poses.len());
-            for (i, pose) in poses.iter().enumerate() {
-                map.scatter(*pose, &g[width * i..width * (i + 1)], &mut gradient);
-                map.scatter(*pose, &reduced_g[width * i..width * (i + 1)], &mut reduced_gradient);
-                let at = packed(width) * *pose as usize;
-                for k in 0..packed(width) {
-                    sums.normal[at + k] += normal[packed(width) * i + k];
-                    sums.reduced[at + k] += reduced[packed(width) * i + k];
+            let (vectors, blocks) = rest.split_at(3 * width * poses.len());
+            let targets = [&mut gradient, &mut reduced_gradient, &mut sums.diagonal];
+            for (target, vector) in
+                targets.into_iter().zip(vectors.chunks_exact((width * poses.len()).max(1)))
+            {
+                for (pose, local) in poses.iter().zip(vector.chunks_exact(width)) {
+                    map.scatter(*pose, local, target);
+                }
+            }
+            let targets = [&mut sums.reduced, &mut sums.normal];
+            for (target, block) in
+                targets.into_iter().zip(blocks.chunks_exact((packed(width) * poses.len()).max(1)))
+            {
+                for (pose, block) in poses.iter().zip(block.chunks_exact(packed(width))) {
+                    let target = &mut target[packed(width) * *pose as usize..][..packed(width)];
+                    target.iter_mut().zip(block).for_each(|(sum, add)| *sum += add);
                 }
             }
         }
         sums.descent = gradient.iter().map(|g| -g).collect();
         sums.reduced_descent = reduced_gradient.iter().map(|g| -g).collect();
-        sums.diagonal = vec![0.0; n];
-        let mut local = vec![0.0; width];
-        for (pose, block) in sums.normal.chunks_exact(packed(width)).enumerate() {
-            (0..width).for_each(|a| local[a] = block[packed(a) + a]);
-            map.scatter(pose as u32, &local, &mut sums.diagonal);
-        }
         cost
     }
 
@@ -200,8 +202,10 @@ impl<'a> Driver<'a> {
                 let Some(pose) = row.pose else { continue };
                 for (b, jb) in row.jacobian[..=a].iter().enumerate() {
                     let at = packed(width) * pose as usize + packed(row.local + a) + row.local + b;
-                    sums.normal[at] += row.weight * ja * jb;
                     sums.reduced[at] += row.weight * ja * jb;
+                    if let Some(normal) = sums.normal.get_mut(at) {
+                        *normal += row.weight * ja * jb;
+                    }
                 }
             }
         }
@@ -306,12 +310,11 @@ impl Backend for Driver<'_> {
 
     fn accept(&mut self) -> Result<(), BundleError> {
         if let Some(next) = self.next.take() {
+            if self.host.wants_cameras() {
+                self.host.accepted(self.side.flatten_cameras(&next));
+            }
             self.host.ask(&PartRequest::Accept)?;
             self.cameras = next;
-            if self.host.wants_cameras() {
-                let numbers = self.side.flatten(&self.cameras);
-                self.host.accepted(numbers);
-            }
         }
         Ok(())
     }

@@ -7,12 +7,12 @@ use rayon::prelude::*;
 
 use super::super::layout::{Cameras, Layout};
 use super::super::step::Tried;
-use super::super::{BundleError, BundleOptions, BundleProblem, Precision, ShardError};
+use super::super::{BundleError, BundleOptions, BundleProblem, Precision, Preconditioner, ShardError};
 use super::clusters::Clusters;
 use super::coarse::{CoarseGroups, middles};
 use super::part::{CameraMap, Part};
 use super::real::Real;
-use super::state::{Frame, PartState};
+use super::state::{Frame, PartState, packed};
 
 /// What is asked of the holder of parts. Vectors are those of all camera unknowns.
 #[derive(Clone, Debug, PartialEq)]
@@ -93,8 +93,13 @@ impl CameraSide {
         &self.clusters
     }
 
+    /// The cameras at the start as numbers: seven of each pose, then the parameters of each of the intrinsics.
+    pub fn flatten(&self) -> Vec<f64> {
+        self.flatten_cameras(&Cameras::new(self.problem.poses.clone(), self.problem.intrinsics.clone()))
+    }
+
     /// Cameras as numbers: seven of each pose, then the parameters of each of the intrinsics.
-    pub(super) fn flatten(&self, cameras: &Cameras) -> Vec<f64> {
+    pub(super) fn flatten_cameras(&self, cameras: &Cameras) -> Vec<f64> {
         let poses = cameras.poses.iter().flat_map(|pose| {
             let (q, t) = (pose.rotation.coords, pose.translation);
             [q.x, q.y, q.z, q.w, t.x, t.y, t.z]
@@ -103,7 +108,7 @@ impl CameraSide {
         poses.chain(intrinsics).collect()
     }
 
-    /// The way back from [`CameraSide::flatten`].
+    /// The way back from [`CameraSide::flatten_cameras`].
     pub(super) fn unflatten(&self, numbers: &[f64]) -> Result<Cameras, BundleError> {
         let (mut poses, mut intrinsics) = (self.problem.poses.clone(), self.problem.intrinsics.clone());
         let params: usize = intrinsics.iter().map(|camera| camera.params().len()).sum();
@@ -211,6 +216,11 @@ impl PartWorker {
         } else {
             PartState::<f32>::held_bytes(&part, stride)
         };
+        // The cluster's factor stays in any case.
+        let unknowns =
+            self.side.map.width() * self.side.clusters.members.get(index as usize).map_or(0, Vec::len);
+        let factor = (unknowns * (unknowns + 1) / 2 * if double { 8 } else { 4 }) as u64;
+        self.memory_bytes = self.memory_bytes.saturating_sub(factor);
         let resident = self.store.is_none() || bytes <= self.memory_bytes;
         self.memory_bytes -= if resident { bytes.min(self.memory_bytes) } else { 0 };
         let part = if resident { part } else { Part::default() };
@@ -241,15 +251,8 @@ impl PartWorker {
         self.parts.iter().map(|held| (held.index, held.resident))
     }
 
-    /// Answers for every part, ascending, or only for those in `only`. What the numbers are depends on the request.
-    ///
-    /// # Errors
-    /// When a part can't be read or written.
-    pub fn answer(
-        &mut self,
-        request: &PartRequest,
-        only: Option<&[u32]>,
-    ) -> Result<Vec<(u32, Vec<f64>)>, BundleError> {
+    /// What a request changes for all parts; before they are asked to answer it.
+    pub fn begin(&mut self, request: &PartRequest) {
         match request {
             PartRequest::Accept => {
                 if let Some(next) = self.next.take() {
@@ -260,6 +263,18 @@ impl PartWorker {
             PartRequest::Linearise { damping, .. } => self.damping = *damping,
             _ => {}
         }
+    }
+
+    /// Answers for every part, ascending, or only for those in `only`, after [`PartWorker::begin`]. What the numbers are
+    /// depends on the request.
+    ///
+    /// # Errors
+    /// When a part can't be read or written.
+    pub fn answer(
+        &mut self,
+        request: &PartRequest,
+        only: Option<&[u32]>,
+    ) -> Result<Vec<(u32, Vec<f64>)>, BundleError> {
         let middles = match request {
             PartRequest::Prepare { coarse: true, .. } => middles(&self.cameras, &self.side.clusters),
             _ => Vec::new(),
@@ -355,7 +370,15 @@ impl<T: Real> Answer for PartState<T> {
                 }
                 let steepest = self.eliminate(*damping);
                 let sums = self.camera_sums(frame.map.stride, steepest);
-                let arrays = [&self.gradient, &sums.reduced_gradient, &sums.normal, &sums.reduced];
+                let width = frame.map.width();
+                let diagonal: Vec<f64> = sums
+                    .normal
+                    .chunks_exact(packed(width))
+                    .flat_map(|block| (0..width).map(|a| block[packed(a) + a]))
+                    .collect();
+                let whole = frame.options.preconditioner == Preconditioner::PowerSeries;
+                let normal = if whole { &sums.normal[..] } else { &[] };
+                let arrays = [&self.gradient, &sums.reduced_gradient, &diagonal, &sums.reduced[..], normal];
                 [self.cost, sums.steepest].iter().chain(arrays.into_iter().flatten()).copied().collect()
             }
             PartRequest::Prepare { diagonal, coarse } => {
