@@ -6,6 +6,7 @@ use std::path::PathBuf;
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use terrane_pipeline::adjustment::{BundleSolver, Loss, Precision, Preconditioner};
 use terrane_pipeline::{CameraOverride, FeatureMethod, Matcher};
 
 /// Photographs in, one geo-referenced sparse reconstruction out.
@@ -51,6 +52,11 @@ pub enum Command {
     Inspect(InspectFlags),
     /// Compare two results: differences of cameras after a robust similarity.
     Compare(CompareFlags),
+    /// Adjust a whole problem: a BAL file or a COLMAP model, in this process or on worker processes.
+    Adjust(AdjustFlags),
+    /// Hold parts of an adjustment for `adjust`, which starts this itself.
+    #[command(hide = true)]
+    Hold(HoldFlags),
     /// Print the options of a run with their values.
     Config(ConfigFlags),
 }
@@ -250,6 +256,83 @@ pub struct CompareFlags {
     pub a: PathBuf,
     /// Another one.
     pub b: PathBuf,
+}
+
+/// Flags of `adjust`.
+#[derive(Debug, Args)]
+pub struct AdjustFlags {
+    /// A "bundle adjustment in the large" text file, a COLMAP model's folder, or the folder of a finished run.
+    pub problem: PathBuf,
+    /// File (of a BAL problem) or folder (of a model) for the result.
+    #[arg(short, long, value_name = "PATH")]
+    pub out: PathBuf,
+    /// Loss of reprojection errors: squared, huber, soft-l1, cauchy, geman-mcclure.
+    #[arg(long, value_name = "NAME", default_value = "squared", value_parser = serde_name::<Loss>)]
+    pub loss: Loss,
+    /// Scale of the loss in pixels.
+    #[arg(long, value_name = "PX", default_value_t = 1.0)]
+    pub loss_scale_px: f64,
+    /// What to refine of a model's cameras beside poses: any of focal, principal-point, distortion, or none. Those of a BAL
+    /// problem are always its focal length, k1 and k2.
+    #[arg(long, value_name = "LIST", value_delimiter = ',', default_value = "focal,distortion")]
+    pub refine: Vec<String>,
+    /// Most steps.
+    #[arg(long, value_name = "N", default_value_t = 50)]
+    pub max_iterations: u32,
+    /// Stop when a step lowers the cost by less than this part.
+    #[arg(long, value_name = "PART", default_value_t = 1e-6)]
+    pub cost_tolerance: f64,
+    /// How steps are solved for: auto, explicit (a factorised camera system), implicit (conjugate gradients).
+    #[arg(long, value_name = "NAME", default_value = "auto", value_parser = serde_name::<BundleSolver>)]
+    pub solver: BundleSolver,
+    /// Preconditioner of conjugate gradients: auto, two-level, cluster-blocks, power-series, block-jacobi.
+    #[arg(long, value_name = "NAME", default_value = "auto", value_parser = serde_name::<Preconditioner>)]
+    pub preconditioner: Preconditioner,
+    /// What products are computed in: single (sums in double), double.
+    #[arg(long, value_name = "NAME", default_value = "single", value_parser = serde_name::<Precision>)]
+    pub precision: Precision,
+    /// Worker processes that hold the points; 0 solves in this process. The result is the same to the last bit.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub workers: u32,
+    /// Threads of this process, or of each worker [default: all cores].
+    #[arg(long, value_name = "N")]
+    pub threads: Option<NonZeroU32>,
+    /// Memory that points may take, here or in each worker, as 2GiB; more than fits is read again from disk for each
+    /// product [default: no limit here, the machine's share for workers].
+    #[arg(long, value_name = "SIZE", value_parser = parse_size)]
+    pub memory: Option<u64>,
+    /// Folder for parts of the problem while it is solved, which all workers can read [default: beside the result].
+    #[arg(long, value_name = "FOLDER")]
+    pub scratch: Option<PathBuf>,
+}
+
+/// Flags of `hold`.
+#[derive(Debug, Args)]
+pub struct HoldFlags {
+    /// Where the solver is.
+    #[command(flatten)]
+    pub remote: RemoteFlags,
+    /// Folder with the parts.
+    #[arg(long, value_name = "FOLDER")]
+    pub scratch: PathBuf,
+    /// Name of this holder.
+    #[arg(long, default_value = "holder")]
+    pub name: String,
+    /// Threads [default: all cores].
+    #[arg(long, value_name = "N")]
+    pub threads: Option<NonZeroU32>,
+    /// Memory that it may use.
+    #[arg(long, value_name = "SIZE", value_parser = parse_size)]
+    pub memory: Option<u64>,
+    /// End with this process.
+    #[arg(long, value_name = "PID", hide = true)]
+    pub parent: Option<u32>,
+}
+
+/// A name as options are written in JSON, with dashes or underscores.
+fn serde_name<T: serde::de::DeserializeOwned>(name: &str) -> Result<T, String> {
+    serde_json::from_value(serde_json::Value::String(name.replace('-', "_")))
+        .map_err(|error| error.to_string())
 }
 
 /// Flags of `config`.

@@ -1,5 +1,6 @@
 //! The terrane binary: parses, resolves, calls one library function, prints its report, exits with a documented code.
 
+mod adjust;
 mod args;
 mod compare;
 mod config;
@@ -45,6 +46,8 @@ fn dispatch(arguments: Arguments) -> Result<(), Failure> {
         Command::Export(flags) => export::export(&flags),
         Command::Inspect(flags) => inspect::inspect(&flags, json),
         Command::Compare(flags) => compare::compare(&flags, json),
+        Command::Adjust(flags) => adjust::adjust(&flags, json),
+        Command::Hold(flags) => adjust::hold(flags),
         Command::Config(flags) => config::dump(&flags),
     }
 }

@@ -20,6 +20,7 @@ pub mod average;
 mod error;
 pub mod georegister;
 pub mod merge;
+pub mod problems;
 pub mod seams;
 mod statistics;
 mod summary;

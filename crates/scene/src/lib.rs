@@ -2,6 +2,7 @@
 //!
 //! This crate knows what things are and how they are written down. It solves nothing and schedules nothing.
 
+pub mod bal;
 pub mod codec;
 pub mod colmap;
 mod error;

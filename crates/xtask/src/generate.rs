@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-const HEADER: &str = "//! Generated from proto/terrane/v1 by `cargo run -p terrane-xtask -- generate`: do not edit.\n";
+const HEADER: &str =
+    "//! Generated from proto/terrane/v1 by `cargo run -p terrane-xtask -- generate`: do not edit.\n";
 const PROTOS: [&str; 2] = ["terrane/v1/coordinator.proto", "terrane/v1/adjuster.proto"];
 
 fn root() -> PathBuf {
