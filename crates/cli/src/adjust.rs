@@ -48,6 +48,7 @@ pub fn adjust(flags: &AdjustFlags, json: bool) -> Result<(), Failure> {
         solver: flags.solver,
         preconditioner: flags.preconditioner,
         precision: flags.precision,
+        linear_tolerance: flags.linear_tolerance,
         ..BundleOptions::default()
     };
     let started = Instant::now();

@@ -288,6 +288,9 @@ pub struct AdjustFlags {
     /// Preconditioner of conjugate gradients: auto, two-level, cluster-blocks, power-series, block-jacobi.
     #[arg(long, value_name = "NAME", default_value = "auto", value_parser = serde_name::<Preconditioner>)]
     pub preconditioner: Preconditioner,
+    /// Conjugate gradients stop when the residual, in the preconditioner's norm, is below this part of the first.
+    #[arg(long, value_name = "PART", default_value_t = 0.1)]
+    pub linear_tolerance: f64,
     /// What products are computed in: single (sums in double), double.
     #[arg(long, value_name = "NAME", default_value = "single", value_parser = serde_name::<Precision>)]
     pub precision: Precision,

@@ -51,6 +51,7 @@ pub(super) struct LocalFactor<T> {
 
 impl<T: Real> LocalFactor<T> {
     /// Solves for the cluster's cameras: reads `right`, the vector of all unknowns, and returns the local solution.
+    #[inline(never)]
     pub fn solve(&mut self, map: &CameraMap, right: &[f64]) -> Vec<f64> {
         let Self { owned, columns, inverse, work } = self;
         work.clear();
@@ -103,6 +104,7 @@ fn owned_cameras(map: &CameraMap, members: &[u32], poses: &[u32]) -> Vec<Owned> 
 
 impl<T: Real> PartState<T> {
     /// Builds and factorises the block of cluster `cluster`; `diagonal` holds the packed diagonal block of every pose.
+    #[inline(never)]
     pub fn factorize_local(&mut self, frame: &Frame<'_>, cluster: usize, diagonal: &[f64]) {
         let owned = owned_cameras(frame.map, &frame.clusters.members[cluster], &self.part.poses);
         let n = owned.last().map_or(0, |last| last.offset as usize + last.num_rows());
@@ -139,6 +141,7 @@ impl<T: Real> PartState<T> {
     }
 
     /// Takes `Z_i Z_jᵀ` of each two of the cluster's cameras that see one of the part's points.
+    #[inline(never)]
     fn subtract_pairs(&self, matrix: &mut [f64], n: usize, owned: &[Owned], stride: usize) {
         let width = 6 + stride;
         let (mut seen, mut values) = (Vec::new(), Vec::new());
