@@ -40,7 +40,7 @@ pub fn adjust(flags: &AdjustFlags, json: bool) -> Result<(), Failure> {
     // Zero means all cores.
     let built = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
     built.map_err(|error| Failure::system(format!("no threads can be had: {error}")))?;
-    let options = BundleOptions {
+    let mut options = BundleOptions {
         loss: flags.loss,
         loss_scale_px: flags.loss_scale_px,
         max_iterations: flags.max_iterations,
@@ -53,6 +53,7 @@ pub fn adjust(flags: &AdjustFlags, json: bool) -> Result<(), Failure> {
     };
     let started = Instant::now();
     let (source, mut whole) = read(flags)?;
+    options.behind_camera = whole.behind_camera;
     let read_seconds = started.elapsed().as_secs_f64();
     let before = ResidualFigures::of(&whole);
     let started = Instant::now();

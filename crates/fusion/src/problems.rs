@@ -3,7 +3,7 @@
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use terrane_geometry::{Camera, CameraModel, Rigid3};
 use terrane_optim::bundle::{
-    BundleObservation, BundleProblem, BundleShard, InMemoryShards, RefineIntrinsics,
+    BehindCamera, BundleObservation, BundleProblem, BundleShard, InMemoryShards, RefineIntrinsics,
 };
 use terrane_scene::Reconstruction;
 use terrane_scene::bal::BalProblem;
@@ -16,6 +16,8 @@ pub struct WholeProblem {
     pub problem: BundleProblem,
     /// One shard, its points in the order of the source.
     pub shards: InMemoryShards,
+    /// Whether the source's cost counts points behind their cameras.
+    pub behind_camera: BehindCamera,
 }
 
 /// Half a turn about x: from a camera that looks down −z with y up to one that looks down z with y down.
@@ -24,7 +26,7 @@ fn half_turn() -> UnitQuaternion<f64> {
 }
 
 /// A BAL problem: each camera its own RADIAL intrinsics, of which the principal point is held at the origin. Image points
-/// have y down.
+/// have y down. The format's cost does not look at the sign of depths, and so points behind cameras count.
 ///
 /// # Errors
 /// When a focal length is not positive.
@@ -54,7 +56,7 @@ pub fn from_bal(bal: BalProblem) -> Result<WholeProblem, FusionError> {
             .collect(),
     };
     shard.observations.sort_unstable_by_key(|o| (o.point, o.pose, o.xy_px.map(f32::to_bits)));
-    Ok(WholeProblem { problem, shards: InMemoryShards(vec![shard]) })
+    Ok(WholeProblem { problem, shards: InMemoryShards(vec![shard]), behind_camera: BehindCamera::Mirror })
 }
 
 /// The parameters of a BAL file after an adjustment.
@@ -102,7 +104,7 @@ pub fn from_model(model: &Reconstruction, refine: RefineIntrinsics) -> Result<Wh
     let points = model.points.iter().map(|point| point.x_in_world).collect();
     let shard = BundleShard { points, fixed_points: false, observations };
     let problem = BundleProblem::new(poses, intrinsics, of_pose, refine);
-    Ok(WholeProblem { problem, shards: InMemoryShards(vec![shard]) })
+    Ok(WholeProblem { problem, shards: InMemoryShards(vec![shard]), behind_camera: BehindCamera::LeaveOut })
 }
 
 /// Takes adjusted cameras and points over into the model that they came from.
@@ -144,6 +146,8 @@ impl ResidualFigures {
                 let pose = o.pose as usize;
                 let x = rotations[pose] * shard.points[o.point as usize] + problem.poses[pose].translation;
                 let camera = &problem.intrinsics[problem.intrinsics_of_pose[pose] as usize];
+                let mirrored = whole.behind_camera == BehindCamera::Mirror && x.z < 0.0;
+                let x = if mirrored { -x } else { x };
                 let Some(xy) = camera.project(&x).filter(|xy| xy.iter().all(|v| v.is_finite())) else {
                     figures.not_projected += 1;
                     continue;

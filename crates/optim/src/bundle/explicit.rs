@@ -54,6 +54,7 @@ impl Setup<'_> {
             cameras,
             loss: self.options.loss,
             loss_scale_px: self.options.loss_scale_px,
+            behind: self.options.behind_camera,
             held_direction: self.held_direction(cameras),
             damping,
         }
@@ -106,7 +107,7 @@ impl<'a> Explicit<'a> {
         for i in 0..shards.len() {
             let shard = shards.load(i)?;
             shard.validate(i, num_poses)?;
-            let dropped = Dropped::find(&shard, problem, &cameras);
+            let dropped = Dropped::find(&shard, problem, &cameras, options.behind_camera);
             let plan = ShardPlan::new(&shard, &dropped, problem);
             plan.observations.iter().for_each(|o| observed[o.pose as usize] = true);
             covisibility.add(&plan);

@@ -6,9 +6,10 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::BundleProblem;
 use super::layout::{Cameras, Layout};
 use super::plan::{Planned, ShardPlan};
+use super::projection::project_with_jacobian;
+use super::{BehindCamera, BundleProblem};
 use crate::Loss;
 
 /// What all observations are linearised against.
@@ -18,6 +19,7 @@ pub(super) struct Context<'a> {
     pub cameras: &'a Cameras,
     pub loss: Loss,
     pub loss_scale_px: f64,
+    pub behind: BehindCamera,
     /// A pose and a direction in its frame along which it must not move.
     pub held_direction: Option<(u32, Vector3<f64>)>,
     pub damping: f64,
@@ -247,7 +249,7 @@ pub(super) fn linearise(
     let camera_index = context.problem.intrinsics_of_pose[pose] as usize;
     let camera = &context.cameras.intrinsics[camera_index];
     let x_in_cam = context.cameras.x_in_cam(pose, x);
-    let Some(projection) = camera.project_with_jacobian(&x_in_cam) else {
+    let Some(projection) = project_with_jacobian(camera, &x_in_cam, context.behind) else {
         *terms = Terms::default();
         intrinsics.fill(0.0);
         return 0.0;

@@ -4,7 +4,7 @@
 //! poses (six unknowns on the left of `cam_from_world`) and refined intrinsics, solved by a sparse or dense Cholesky
 //! factorisation. Robust losses act by re-weighting.
 //!
-//! Observations whose point starts behind the camera take no part in the solve. A step that would carry a point behind
+//! Observations whose point starts behind the camera take no part in the solve, unless [`BehindCamera::Mirror`] says so. A step that would carry a point behind
 //! a camera is shortened for this point; if that does not help it counts as no descent.
 
 mod explicit;
@@ -16,6 +16,7 @@ mod options;
 mod pattern;
 mod plan;
 mod problem;
+mod projection;
 mod reduced;
 mod report;
 mod schur;
@@ -23,7 +24,7 @@ mod shards;
 mod solver;
 mod step;
 
-pub use options::{BundleOptions, BundleSolver, Gauge, Precision, Preconditioner};
+pub use options::{BehindCamera, BundleOptions, BundleSolver, Gauge, Precision, Preconditioner};
 pub use problem::{BundleProblem, FocalPrior, PositionPrior, RefineIntrinsics};
 pub use report::{BundleReport, Termination};
 pub use shards::{BundleObservation, BundleShard, InMemoryShards, ShardError, Shards};

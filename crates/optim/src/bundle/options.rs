@@ -20,6 +20,18 @@ pub enum Gauge {
     TwoPoses,
 }
 
+/// What becomes of observations whose point lies behind the camera.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BehindCamera {
+    /// They take no part when the point starts there, and no step leads there.
+    #[default]
+    LeaveOut,
+    /// They count as the formula of a perspective camera says, which does not look at the sign of the depth: what problems
+    /// of the literature (BAL) mean by their cost.
+    Mirror,
+}
+
 /// How the linear systems of an adjustment are solved.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -71,6 +83,8 @@ pub struct BundleOptions {
     pub loss: Loss,
     /// Scale of that loss in pixels. Range: above 0. Default 1.
     pub loss_scale_px: f64,
+    /// What becomes of observations whose point lies behind the camera. Default: left out.
+    pub behind_camera: BehindCamera,
     /// Loss of position priors. Default: squared.
     pub prior_loss: Loss,
     /// Scale of the priors' loss in standard deviations. Range: above 0. Default 3.
@@ -111,6 +125,7 @@ impl Default for BundleOptions {
         Self {
             loss: Loss::Squared,
             loss_scale_px: 1.0,
+            behind_camera: BehindCamera::LeaveOut,
             prior_loss: Loss::Squared,
             prior_loss_scale_sigma: 3.0,
             max_iterations: 50,

@@ -3,7 +3,8 @@
 use std::ops::Range;
 
 use super::layout::{Cameras, NONE};
-use super::{BundleProblem, BundleShard};
+use super::projection::project;
+use super::{BehindCamera, BundleProblem, BundleShard};
 
 /// About as many observations go into one unit of parallel work; fixed, so that results do not depend on threads.
 const OBSERVATIONS_PER_CHUNK: usize = 512;
@@ -47,7 +48,12 @@ pub(super) struct Dropped {
 
 impl Dropped {
     /// Leaves out what is behind its camera, and then points seen fewer than twice (unless points are fixed).
-    pub fn find(shard: &BundleShard, problem: &BundleProblem, cameras: &Cameras) -> Self {
+    pub fn find(
+        shard: &BundleShard,
+        problem: &BundleProblem,
+        cameras: &Cameras,
+        behind: BehindCamera,
+    ) -> Self {
         let mut dropped = Self::default();
         let needed = if shard.fixed_points { 1 } else { 2 };
         let mut start = 0;
@@ -60,7 +66,7 @@ impl Dropped {
                 let pose = shard.observations[i].pose as usize;
                 let camera = &cameras.intrinsics[problem.intrinsics_of_pose[pose] as usize];
                 let x_in_cam = cameras.x_in_cam(pose, &shard.points[point as usize]);
-                match camera.project(&x_in_cam) {
+                match project(camera, &x_in_cam, behind) {
                     Some(xy) if xy.iter().all(|v| v.is_finite()) => seen.push(i as u32),
                     _ => {
                         dropped.behind_camera += 1;

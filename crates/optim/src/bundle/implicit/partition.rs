@@ -40,7 +40,7 @@ pub fn partition(
     for index in 0..shards.len() {
         let shard = shards.load(index)?;
         shard.validate(index, num_poses)?;
-        let out = Dropped::find(&shard, problem, &cameras);
+        let out = Dropped::find(&shard, problem, &cameras, options.behind_camera);
         let mut skip = out.observations.iter().copied().peekable();
         let mut last = None;
         for (i, o) in shard.observations.iter().enumerate() {

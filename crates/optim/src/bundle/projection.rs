@@ -1,0 +1,34 @@
+//! Projection of points on either side of a camera.
+
+use nalgebra::{Vector2, Vector3};
+use terrane_geometry::Camera;
+use terrane_geometry::camera::Projection;
+
+use super::BehindCamera;
+
+/// Where a point is seen, or `None` where that has no meaning.
+#[inline(always)]
+pub(super) fn project(camera: &Camera, x_in_cam: &Vector3<f64>, behind: BehindCamera) -> Option<Vector2<f64>> {
+    match behind {
+        // The formula divides by z, whatever its sign: the point on the other side of the centre has the same image.
+        BehindCamera::Mirror if x_in_cam.z < 0.0 => camera.project(&-x_in_cam),
+        _ => camera.project(x_in_cam),
+    }
+}
+
+/// The same, with derivatives.
+#[inline(always)]
+pub(super) fn project_with_jacobian(
+    camera: &Camera,
+    x_in_cam: &Vector3<f64>,
+    behind: BehindCamera,
+) -> Option<Projection> {
+    match behind {
+        BehindCamera::Mirror if x_in_cam.z < 0.0 => {
+            let mut projection = camera.project_with_jacobian(&-x_in_cam)?;
+            projection.d_point = -projection.d_point;
+            Some(projection)
+        }
+        _ => camera.project_with_jacobian(x_in_cam),
+    }
+}
