@@ -25,6 +25,14 @@ fn half_turn() -> UnitQuaternion<f64> {
     UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
 }
 
+/// Reads a BAL file; see [`from_bal`].
+///
+/// # Errors
+/// When the file is broken ([`terrane_scene::bal::read`]) or a focal length is not positive.
+pub fn read_bal(file: impl std::io::BufRead) -> Result<WholeProblem, FusionError> {
+    from_bal(terrane_scene::bal::read(file).map_err(|error| FusionError::invalid("the BAL problem", error))?)
+}
+
 /// A BAL problem: each camera its own RADIAL intrinsics, of which the principal point is held at the origin. Image points
 /// have y down. The format's cost does not look at the sign of depths, and so points behind cameras count.
 ///

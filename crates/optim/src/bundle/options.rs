@@ -113,6 +113,9 @@ pub struct BundleOptions {
     pub linear_tolerance: f64,
     /// Most iterations of conjugate gradients for a step. Default 500.
     pub max_linear_iterations: u32,
+    /// Most poses of a cluster of the implicit solver. Range: at least 1. Default 64: a cluster's block then fits into the
+    /// second cache, and its factor costs no more than the products that it saves.
+    pub cluster_poses: u32,
     /// How the explicit reduced camera system is factorised. Default: by size and fill.
     pub linear_solver: LinearSolver,
     /// Memory for shards' linearisations that are kept between passes, in bytes; shards beyond it are linearised again
@@ -139,6 +142,7 @@ impl Default for BundleOptions {
             precision: Precision::Single,
             linear_tolerance: 0.1,
             max_linear_iterations: 500,
+            cluster_poses: 64,
             linear_solver: LinearSolver::Auto,
             linearisation_memory_bytes: 1 << 30,
         }
@@ -171,6 +175,9 @@ impl BundleOptions {
                     "option {name} must be within [0, 1), not {value}"
                 )));
             }
+        }
+        if self.cluster_poses == 0 {
+            return Err(BundleError::invalid("option cluster_poses must be at least 1".to_owned()));
         }
         Ok(())
     }

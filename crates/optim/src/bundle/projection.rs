@@ -8,7 +8,11 @@ use super::BehindCamera;
 
 /// Where a point is seen, or `None` where that has no meaning.
 #[inline(always)]
-pub(super) fn project(camera: &Camera, x_in_cam: &Vector3<f64>, behind: BehindCamera) -> Option<Vector2<f64>> {
+pub(super) fn project(
+    camera: &Camera,
+    x_in_cam: &Vector3<f64>,
+    behind: BehindCamera,
+) -> Option<Vector2<f64>> {
     match behind {
         // The formula divides by z, whatever its sign: the point on the other side of the centre has the same image.
         BehindCamera::Mirror if x_in_cam.z < 0.0 => camera.project(&-x_in_cam),

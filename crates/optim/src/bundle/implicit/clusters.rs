@@ -6,10 +6,6 @@ use super::super::plan::Dropped;
 use super::super::{BundleError, BundleProblem, BundleShard, Shards};
 use super::part::Part;
 
-/// Poses of a cluster, at most. A cluster's block then fits into the second cache, and its factor costs no more than the
-/// products that it saves.
-const MAX_POSES: usize = 64;
-
 /// Which cluster every pose belongs to.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Clusters {
@@ -57,7 +53,7 @@ impl Views {
 
     /// Cuts the poses into balanced clusters, again and again across the coordinate in which their centres, or the means
     /// of the points that they see, are spread widest.
-    pub fn cluster(&self, problem: &BundleProblem) -> Clusters {
+    pub fn cluster(&self, problem: &BundleProblem, most_poses: usize) -> Clusters {
         let places: Vec<Vector6<f64>> = (0..self.counts.len())
             .map(|pose| {
                 let center = problem.poses[pose].center();
@@ -68,7 +64,7 @@ impl Views {
             .collect();
         let (mut of_pose, mut count) = (vec![0; places.len()], 0);
         let mut poses: Vec<u32> = (0..places.len() as u32).collect();
-        split(&mut poses, places.len().div_ceil(MAX_POSES), &places, &mut of_pose, &mut count);
+        split(&mut poses, places.len().div_ceil(most_poses.max(1)), &places, &mut of_pose, &mut count);
         Clusters::new(of_pose)
     }
 }

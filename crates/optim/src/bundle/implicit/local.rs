@@ -141,61 +141,106 @@ impl<T: Real> PartState<T> {
     }
 
     /// Takes `Z_i Z_jᵀ` of each two of the cluster's cameras that see one of the part's points.
-    #[inline(never)]
     fn subtract_pairs(&self, matrix: &mut [f64], n: usize, owned: &[Owned], stride: usize) {
-        let width = 6 + stride;
-        let (mut seen, mut values) = (Vec::new(), Vec::new());
+        by_stride!(stride, K, WIDTH => self.subtract_pairs_of::<K, WIDTH>(matrix, n, owned));
+    }
+
+    fn subtract_pairs_of<const K: usize, const W: usize>(
+        &self,
+        matrix: &mut [f64],
+        n: usize,
+        owned: &[Owned],
+    ) {
+        // Of each observation three columns of `Z`, one after another.
+        let (mut seen, mut values) = (Vec::<(u32, u32)>::new(), Vec::<[f64; W]>::new());
         for (at, camera) in owned.iter().enumerate().filter(|(_, camera)| camera.camera != NONE) {
             let index = camera.camera as usize;
+            let rows: smallvec::SmallVec<[usize; 24]> = camera.rows().collect();
             for group in self.lanes.first_group[index] as usize..self.lanes.first_group[index + 1] as usize {
-                let z = by_stride!(stride, K => widest(#[inline(always)] || self.lanes.group_z::<K>(index, group)));
+                let z = widest(
+                    #[inline(always)]
+                    || self.lanes.group_z::<K, W>(index, group),
+                );
                 for (l, point) in self.lanes.points[group].iter().enumerate() {
                     if *point < self.part.first_fixed_point {
                         seen.push((*point, at as u32));
-                        for row in camera.rows() {
-                            debug_assert!(row < width);
-                            values.extend((0..3).map(|c| z[row][c][l].to_f64()));
+                        for c in 0..3 {
+                            let mut column = [0.0; W];
+                            rows.iter().enumerate().for_each(|(i, row)| column[i] = z[*row][c][l].to_f64());
+                            values.push(column);
                         }
-                        // Every item takes as much room.
-                        values.resize(3 * width * seen.len(), 0.0);
                     }
                 }
             }
         }
-        let mut order: Vec<u32> = (0..seen.len() as u32).collect();
-        order.sort_by_key(|i| seen[*i as usize]);
-        for run in order.chunk_by(|a, b| seen[*a as usize].0 == seen[*b as usize].0) {
+        for run in by_point(&seen, self.part.points.len()) {
             for (at, first) in run.iter().enumerate() {
                 let a = &owned[seen[*first as usize].1 as usize];
-                let za = &values[3 * width * *first as usize..][..3 * a.num_rows()];
+                let za = &values[3 * *first as usize..][..3];
                 for second in &run[at + 1..] {
                     let b = &owned[seen[*second as usize].1 as usize];
-                    if a.offset != b.offset {
-                        let zb = &values[3 * width * *second as usize..][..3 * b.num_rows()];
-                        widest(
-                            #[inline(always)]
-                            || subtract_block(matrix, n, (b.offset as usize, zb), (a.offset as usize, za)),
-                        );
+                    let zb = &values[3 * *second as usize..][..3];
+                    let place = (b.offset as usize, a.offset as usize);
+                    if a.offset == b.offset {
+                        continue;
                     }
+                    widest(
+                        #[inline(always)]
+                        || {
+                            if b.num_rows() == W {
+                                subtract_block::<W>(
+                                    &mut matrix[n * place.1 + place.0..],
+                                    n,
+                                    (zb, W),
+                                    (za, a.num_rows()),
+                                );
+                            } else {
+                                let rows = b.num_rows();
+                                subtract_block::<W>(
+                                    &mut matrix[n * place.1 + place.0..],
+                                    n,
+                                    (zb, rows),
+                                    (za, a.num_rows()),
+                                );
+                            }
+                        },
+                    );
                 }
             }
         }
     }
 }
 
-/// `matrix[rows, columns] −= Z_rows Z_columnsᵀ`, column-major.
+/// The indices of `seen` by point, those of one point ascending.
+fn by_point(seen: &[(u32, u32)], num_points: usize) -> impl Iterator<Item = Vec<u32>> {
+    let mut start = vec![0u32; num_points + 1];
+    seen.iter().for_each(|(point, _)| start[*point as usize + 1] += 1);
+    for point in 0..num_points {
+        start[point + 1] += start[point];
+    }
+    let mut next = start.clone();
+    let mut order = vec![0u32; seen.len()];
+    for (index, (point, _)) in seen.iter().enumerate() {
+        order[next[*point as usize] as usize] = index as u32;
+        next[*point as usize] += 1;
+    }
+    (0..num_points).map(move |point| order[start[point] as usize..start[point + 1] as usize].to_vec())
+}
+
+/// `matrix −= Z_rows Z_columnsᵀ`, column-major with columns `n` apart; of each `Z` as many rows as its camera has.
 #[inline(always)]
-fn subtract_block(
+fn subtract_block<const W: usize>(
     matrix: &mut [f64],
     n: usize,
-    (row, z_rows): (usize, &[f64]),
-    (column, z_columns): (usize, &[f64]),
+    (z_rows, num_rows): (&[[f64; W]], usize),
+    (z_columns, num_columns): (&[[f64; W]], usize),
 ) {
-    for (c, zc) in z_columns.as_chunks::<3>().0.iter().enumerate() {
-        let start = n * (column + c) + row;
-        let target = &mut matrix[start..start + z_rows.len() / 3];
-        for (value, zr) in target.iter_mut().zip(z_rows.as_chunks::<3>().0) {
-            *value -= zr[0] * zc[0] + zr[1] * zc[1] + zr[2] * zc[2];
+    for c in 0..num_columns {
+        let [c0, c1, c2] = [z_columns[0][c], z_columns[1][c], z_columns[2][c]];
+        let target = &mut matrix[n * c..n * c + num_rows];
+        for (i, value) in target.iter_mut().enumerate() {
+            *value =
+                (-z_rows[0][i]).mul_add(c0, (-z_rows[1][i]).mul_add(c1, (-z_rows[2][i]).mul_add(c2, *value)));
         }
     }
 }

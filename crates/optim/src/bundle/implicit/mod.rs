@@ -20,6 +20,8 @@ mod real;
 mod solver;
 mod state;
 mod system;
+#[cfg(test)]
+mod tests;
 mod trial;
 mod worker;
 

@@ -55,7 +55,7 @@ pub fn partition(
         report.seen_once += out.seen_once;
         dropped.push(out);
     }
-    let clusters = views.cluster(problem);
+    let clusters = views.cluster(problem, options.cluster_poses as usize);
     let Parted { parts, origins } = make_parts(shards, &dropped, &clusters)?;
     let side = CameraSide::new(problem.clone(), options.clone(), views.observed(), clusters);
     report.unconstrained_poses = super::super::explicit::unconstrained(problem, &side.layout, None);

@@ -52,7 +52,7 @@ impl<T: Real> LaneArrays<T> {
         scratch.image.resize(self.points.len(), [splat(T::default()); 2]);
         scratch.point.clear();
         scratch.point.resize(self.inverse.len(), [T::default(); 4]);
-        by_stride!(stride, K => widest(#[inline(always)] || self.run::<K>(x, y, scratch)));
+        by_stride!(stride, K, WIDTH => widest(#[inline(always)] || self.run::<K>(x, y, scratch)));
     }
 
     /// Only the first half: `J_pᵀ J_c x` of each point, for [`Scratch::asked_of`].
@@ -60,7 +60,7 @@ impl<T: Real> LaneArrays<T> {
         scratch.image.resize(self.points.len(), [splat(T::default()); 2]);
         scratch.point.clear();
         scratch.point.resize(self.inverse.len(), [T::default(); 4]);
-        by_stride!(stride, K => widest(#[inline(always)] || {
+        by_stride!(stride, K, WIDTH => widest(#[inline(always)] || {
             for (camera, x) in x.chunks_exact(6 + K).enumerate() {
                 self.forward::<K>(camera, x, scratch);
             }

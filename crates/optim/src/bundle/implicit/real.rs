@@ -121,19 +121,24 @@ pub(super) fn sum<T: Real>(a: &Lanes<T>) -> f64 {
     (half[0] + half[2]) + (half[1] + half[3])
 }
 
-/// Runs an expression with a constant for the stride of intrinsics, so that loops over it are unrolled.
+/// Runs an expression with constants for the stride of intrinsics and the width of a camera, six more, so that loops over
+/// them are unrolled.
 macro_rules! by_stride {
-    ($stride:expr, $k:ident => $work:expr) => {
-        by_stride!(@ $stride, $k, $work, 0 1 2 3 4 6 8 12)
+    ($stride:expr, $k:ident, $width:ident => $work:expr) => {
+        by_stride!(@ $stride, $k, $width, $work, 0 1 2 3 4 6 8 12)
     };
-    (@ $stride:expr, $k:ident, $work:expr, $($n:literal)*) => {
+    (@ $stride:expr, $k:ident, $width:ident, $work:expr, $($n:literal)*) => {
         match $stride {
             $($n => {
                 const $k: usize = $n;
+                #[allow(dead_code)]
+                const $width: usize = 6 + $n;
                 $work
             })*
             _ => {
                 const $k: usize = terrane_geometry::camera::MAX_PARAMS;
+                #[allow(dead_code)]
+                const $width: usize = 6 + $k;
                 $work
             }
         }

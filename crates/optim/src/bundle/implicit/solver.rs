@@ -366,3 +366,53 @@ fn coarse_priors(side: &CameraSide, priors: &[PriorRow]) -> (Vec<Vec<PosePrior>>
     }
     (of_pose, shared)
 }
+
+#[cfg(test)]
+pub(super) use prepared::Prepared;
+
+#[cfg(test)]
+mod prepared {
+    use super::*;
+
+    /// A linearised problem of which tests look at the system.
+    pub struct Prepared {
+        side: Arc<CameraSide>,
+        host: LocalHost,
+        poses: Vec<Vec<u32>>,
+        sums: Sums,
+        inverse: Inverse,
+    }
+
+    impl Prepared {
+        pub fn new(side: Arc<CameraSide>, mut host: LocalHost, poses: Vec<Vec<u32>>, damping: f64) -> Self {
+            let mut driver = Driver::new(side.clone(), &mut host, poses.clone()).unwrap();
+            driver.linearise(damping, true).unwrap();
+            driver.prepare().unwrap();
+            let Driver { sums, inverse, .. } = driver;
+            Self { side, host, poses, sums, inverse }
+        }
+
+        pub fn num_unknowns(&self) -> usize {
+            self.side.map.num_unknowns
+        }
+
+        fn system(&mut self) -> Preconditioned<'_> {
+            let system = CameraSystem {
+                side: &self.side,
+                host: &mut self.host,
+                poses: &self.poses,
+                damping: &self.sums.damping,
+                priors: &self.sums.priors,
+            };
+            Preconditioned { system, inverse: &mut self.inverse }
+        }
+
+        pub fn multiply(&mut self, x: &[f64]) -> Vec<f64> {
+            conjugate_gradients::System::multiply(&mut self.system(), x).unwrap()
+        }
+
+        pub fn precondition(&mut self, r: &[f64]) -> Vec<f64> {
+            conjugate_gradients::System::precondition(&mut self.system(), r).unwrap()
+        }
+    }
+}

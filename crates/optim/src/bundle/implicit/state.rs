@@ -195,7 +195,9 @@ fn linearise<T: Real>(
 ) -> f64 {
     let camera = &frame.cameras.intrinsics[frame.problem.intrinsics_of_pose[seen.pose] as usize];
     let x_in_cam = frame.cameras.x_in_cam(seen.pose, x);
-    let Some(projection) = project_with_jacobian(camera, &x_in_cam, frame.options.behind_camera) else { return 0.0 };
+    let Some(projection) = project_with_jacobian(camera, &x_in_cam, frame.options.behind_camera) else {
+        return 0.0;
+    };
     let residual = [0, 1].map(|row| projection.xy_px[row] - f64::from(seen.xy_px[row]));
     let squared = residual[0] * residual[0] + residual[1] * residual[1];
     let (rho, weight) = frame.options.loss.evaluate(squared, frame.options.loss_scale_px);

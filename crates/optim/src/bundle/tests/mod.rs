@@ -13,22 +13,22 @@ use super::*;
 use crate::Loss;
 
 /// A block of photographs from above over bumpy ground, with truth.
-struct Scene {
-    truth: BundleProblem,
-    shard: BundleShard,
+pub(super) struct Scene {
+    pub truth: BundleProblem,
+    pub shard: BundleShard,
 }
 
 /// What a scene is made of.
 #[derive(Clone, Copy)]
-struct SceneOptions {
-    columns: usize,
-    rows: usize,
-    points: usize,
-    model: CameraModel,
+pub(super) struct SceneOptions {
+    pub columns: usize,
+    pub rows: usize,
+    pub points: usize,
+    pub model: CameraModel,
     /// Poses share this many intrinsics in turn; 0: each has its own.
-    num_intrinsics: usize,
-    noise_px: f64,
-    seed: u64,
+    pub num_intrinsics: usize,
+    pub noise_px: f64,
+    pub seed: u64,
 }
 
 impl Default for SceneOptions {
@@ -46,22 +46,22 @@ impl Default for SceneOptions {
 }
 
 /// About normally distributed numbers of unit variance.
-struct Noise(rand_pcg::Pcg64Mcg);
+pub(super) struct Noise(rand_pcg::Pcg64Mcg);
 
 impl Noise {
-    fn new(seed: u64) -> Self {
+    pub fn new(seed: u64) -> Self {
         Self(Seed(seed).rng())
     }
 
-    fn next(&mut self) -> f64 {
+    pub fn next(&mut self) -> f64 {
         (0..12).map(|_| self.0.random_range(-0.5..0.5)).sum()
     }
 
-    fn vector(&mut self) -> Vector3<f64> {
+    pub fn vector(&mut self) -> Vector3<f64> {
         Vector3::new(self.next(), self.next(), self.next())
     }
 
-    fn uniform(&mut self, range: std::ops::Range<f64>) -> f64 {
+    pub fn uniform(&mut self, range: std::ops::Range<f64>) -> f64 {
         self.0.random_range(range)
     }
 }
@@ -76,7 +76,7 @@ fn camera(model: CameraModel) -> Camera {
 }
 
 impl Scene {
-    fn new(options: SceneOptions) -> Self {
+    pub fn new(options: SceneOptions) -> Self {
         let mut noise = Noise::new(options.seed);
         let down =
             Rotation3::from_matrix_unchecked(nalgebra::Matrix3::new(1., 0., 0., 0., -1., 0., 0., 0., -1.));
@@ -109,7 +109,7 @@ impl Scene {
     }
 
     /// The scene with everything moved from the truth by a few pixels' worth.
-    fn disturbed(&self, seed: u64) -> (BundleProblem, BundleShard) {
+    pub fn disturbed(&self, seed: u64) -> (BundleProblem, BundleShard) {
         let mut noise = Noise::new(seed);
         let (mut problem, mut shard) = (self.truth.clone(), self.shard.clone());
         for pose in &mut problem.poses {
@@ -198,7 +198,7 @@ pub(super) fn linearised_scene(num_params: usize) -> LinearisedScene {
     problem.refine.fill(refine);
     let cameras = super::layout::Cameras::new(problem.poses.clone(), problem.intrinsics.clone());
     let layout = super::layout::Layout::new(&problem, &vec![true; problem.poses.len()], None);
-    let dropped = super::plan::Dropped::find(&shard, &problem, &cameras);
+    let dropped = super::plan::Dropped::find(&shard, &problem, &cameras, BehindCamera::LeaveOut);
     let plan = super::plan::ShardPlan::new(&shard, &dropped, &problem);
     let context = super::linearisation::Context {
         problem: &problem,
@@ -206,6 +206,7 @@ pub(super) fn linearised_scene(num_params: usize) -> LinearisedScene {
         cameras: &cameras,
         loss: Loss::Huber,
         loss_scale_px: 1.0,
+        behind: BehindCamera::LeaveOut,
         held_direction: None,
         damping: 1e-3,
     };

@@ -42,7 +42,8 @@ fn setup(model: CameraModel, num_intrinsics: usize, columns: usize) -> Setup {
         .observations
         .insert(0, BundleObservation { xy_px: [twice.xy_px[0] + 2.0, twice.xy_px[1] - 1.0], ..twice });
     let cameras = Cameras::new(problem.poses.clone(), problem.intrinsics.clone());
-    let plan = ShardPlan::new(&shard, &Dropped::find(&shard, &problem, &cameras), &problem);
+    let plan =
+        ShardPlan::new(&shard, &Dropped::find(&shard, &problem, &cameras, BehindCamera::LeaveOut), &problem);
     let observed: Vec<bool> = (0..problem.poses.len()).map(|pose| !plan.of_pose(pose).is_empty()).collect();
     let layout = Layout::new(&problem, &observed, None);
     Setup { problem, shard, layout, cameras, plan }
@@ -56,6 +57,7 @@ impl Setup {
             cameras: &self.cameras,
             loss,
             loss_scale_px: 2.0,
+            behind: BehindCamera::LeaveOut,
             held_direction: None,
             damping: 0.01,
         }
