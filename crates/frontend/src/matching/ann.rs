@@ -6,6 +6,7 @@ use super::cells::{Cells, Image, Two, near};
 use super::distance::Measured;
 use super::nearest::Nearest;
 use super::sketch::Sketches;
+use super::sweep::SweepPath;
 
 /// Cells that each descriptor looks into: 0.993 of the matches of real pairs; 4 find 0.986, 6 find 0.996.
 const NUM_PROBES: usize = 5;
@@ -18,9 +19,9 @@ pub(super) struct Prepared {
 }
 
 impl Prepared {
-    pub(super) fn new(descriptors: Vec<[u8; DESCRIPTOR_LEN]>, with_avx2: bool) -> Self {
+    pub(super) fn new(descriptors: Vec<[u8; DESCRIPTOR_LEN]>, path: SweepPath) -> Self {
         let sketches = Sketches::new(&descriptors);
-        Self { cells: Cells::new(&sketches, with_avx2), sketches, descriptors: Measured::new(descriptors) }
+        Self { cells: Cells::new(&sketches, path), sketches, descriptors: Measured::new(descriptors) }
     }
 
     pub(super) fn descriptors(&self) -> &[[u8; DESCRIPTOR_LEN]] {

@@ -58,7 +58,7 @@ impl Prepared {
         let sketches = Sketches::new(&descriptors);
         let descriptors = Measured::new(descriptors);
         Self {
-            cells: Cells::new(&sketches, paths.sweep != SweepPath::Scalar),
+            cells: Cells::new(&sketches, paths.sweep),
             sweep_rows: paths.sweep.rows(&sketches.coarse.codes),
             sweep_columns: paths.sweep.columns(&sketches.fine.codes),
             sketches,

@@ -4,6 +4,7 @@
 use super::distance::{Measured, distances};
 use super::nearest::Neighbour;
 use super::sketch::Sketches;
+use super::sweep::SweepPath;
 use super::sweep::closest::{Guessed, NOBODY, closest};
 
 /// Descriptors of a cell, on average.
@@ -35,11 +36,11 @@ pub(super) struct Image<'a> {
 }
 
 impl Cells {
-    pub(super) fn new(sketches: &Sketches, with_avx2: bool) -> Self {
+    pub(super) fn new(sketches: &Sketches, path: SweepPath) -> Self {
         let len = sketches.fine.codes.len();
         let num_leaders = len.div_ceil(CELL_SIZE);
         let leaders: Vec<u32> = (0..num_leaders).map(|at| (at * len / num_leaders) as u32).collect();
-        let guessed = |of: &[u32]| Guessed::new(&gathered(&sketches.fine.codes, of), with_avx2);
+        let guessed = |of: &[u32]| Guessed::new(&gathered(&sketches.fine.codes, of), path);
         let leaders_guessed = guessed(&leaders);
         let mut members = vec![Vec::new(); num_leaders];
         let bases = sketches.score_bases(sketches);

@@ -34,9 +34,7 @@ impl PreparedImage {
                 Kind::Exact { descriptors, rows, columns }
             }
             Matcher::Cascade => Kind::Cascade(Box::new(Prepared::new(paths(), descriptors))),
-            Matcher::Ann => {
-                Kind::Ann(Box::new(ann::Prepared::new(descriptors, paths().sweep != SweepPath::Scalar)))
-            }
+            Matcher::Ann => Kind::Ann(Box::new(ann::Prepared::new(descriptors, paths().sweep))),
         })
     }
 

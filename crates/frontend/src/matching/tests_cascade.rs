@@ -237,13 +237,15 @@ fn approximate_matches_are_mostly_the_exact_ones() {
     let second = seen_again(&first, 18);
     let options = MatchOptions::default();
     let truth = matches_of(&MatchKernel::fastest().nearest(&first, &second), &first, &second, &options);
-    let nearest = |with_avx2: bool| {
-        let prepared = |descriptors: &[Descriptor]| ann::Prepared::new(descriptors.to_vec(), with_avx2);
+    let nearest = |path: SweepPath| {
+        let prepared = |descriptors: &[Descriptor]| ann::Prepared::new(descriptors.to_vec(), path);
         ann::nearest(&prepared(&first), &prepared(&second))
     };
-    let with_avx2 = SweepPath::fastest() != SweepPath::Scalar;
-    assert_eq!(nearest(with_avx2), nearest(false));
-    let found = matches_of(&nearest(with_avx2), &first, &second, &options);
+    let scalar = nearest(SweepPath::Scalar);
+    for &path in SweepPath::available() {
+        assert_eq!(nearest(path), scalar, "{}", path.name());
+    }
+    let found = matches_of(&scalar, &first, &second, &options);
     let pairs = |matches: &[Match]| matches.iter().map(|m| (m.first, m.second)).collect::<Vec<_>>();
     let truth = pairs(&truth);
     let right = pairs(&found).iter().filter(|pair| truth.contains(pair)).count();

@@ -180,7 +180,7 @@ fn collect(masks: &[u16; ROWS], (first_row, first_column): (usize, usize), survi
 
 #[target_feature(enable = "avx512f")]
 #[inline]
-fn load(words: &[i32; WIDTH]) -> __m512i {
+pub(super) fn load(words: &[i32; WIDTH]) -> __m512i {
     // SAFETY: the reference covers 64 bytes, and the load needs no alignment.
     unsafe { _mm512_loadu_si512(words.as_ptr().cast()) }
 }

@@ -4,10 +4,10 @@
 //! sketch, all modulo 2¹⁶: guesses may be wrong, and whoever uses them computes distances. Columns are dealt to 32 lanes
 //! in turn. Of each lane the best column counts, the first of equals; of the lanes the best few, the first of equals.
 
-use crate::matching::sketch::{Code, SKETCH_LEN};
-
+use super::SweepPath;
 #[cfg(target_arch = "x86_64")]
-use super::avx2;
+use super::{avx2, closest_avx512};
+use crate::matching::sketch::{Code, SKETCH_LEN};
 
 /// Lanes that columns are dealt to.
 pub(super) const LANES: usize = 32;
@@ -19,16 +19,22 @@ pub(in crate::matching) enum Guessed {
     Scalar(Vec<Code>),
     #[cfg(target_arch = "x86_64")]
     Avx2(avx2::Columns),
+    #[cfg(target_arch = "x86_64")]
+    Avx512(closest_avx512::Columns),
 }
 
 impl Guessed {
-    pub(in crate::matching) fn new(fine: &[Code], with_avx2: bool) -> Self {
-        #[cfg(target_arch = "x86_64")]
-        if with_avx2 {
-            return Guessed::Avx2(avx2::Columns::new(fine));
+    /// Laid out for the path of a sweep.
+    pub(in crate::matching) fn new(fine: &[Code], path: SweepPath) -> Self {
+        match path {
+            SweepPath::Scalar => Guessed::Scalar(fine.to_vec()),
+            #[cfg(target_arch = "x86_64")]
+            SweepPath::Avx512 if closest_avx512::is_available() => {
+                Guessed::Avx512(closest_avx512::Columns::new(fine))
+            }
+            #[cfg(target_arch = "x86_64")]
+            SweepPath::Avx2 | SweepPath::Avx512 => Guessed::Avx2(avx2::Columns::new(fine)),
         }
-        let _ = with_avx2;
-        Guessed::Scalar(fine.to_vec())
     }
 }
 
@@ -42,6 +48,8 @@ pub(in crate::matching) fn closest<const N: usize>(
         Guessed::Scalar(columns) => rows.iter().map(|row| of_row(row, columns, bases)).collect(),
         #[cfg(target_arch = "x86_64")]
         Guessed::Avx2(columns) => avx2::closest(rows, columns, bases),
+        #[cfg(target_arch = "x86_64")]
+        Guessed::Avx512(columns) => closest_avx512::closest(rows, columns, bases),
     }
 }
 
@@ -91,13 +99,26 @@ mod tests {
                 columns[35] = columns[3];
             }
             let bases: Vec<i16> = (0..count).map(|k| [0, 40, -32_768, 32_767, 900][k % 5]).collect();
-            let scalar = closest::<5>(&rows, &Guessed::new(&columns, false), &bases);
+            let of_path = |path| closest::<5>(&rows, &Guessed::new(&columns, path), &bases);
+            let scalar = of_path(SweepPath::Scalar);
             assert!(
                 scalar.iter().all(|guesses| guesses.iter().filter(|g| **g != NOBODY).count() == count.min(5))
             );
-            #[cfg(target_arch = "x86_64")]
-            if avx2::is_available() {
-                assert_eq!(closest::<5>(&rows, &Guessed::new(&columns, true), &bases), scalar, "{count}");
+            for &path in SweepPath::available() {
+                assert_eq!(of_path(path), scalar, "{count} by {}", path.name());
+            }
+        }
+    }
+
+    #[test]
+    fn columns_without_a_score_are_nobody_on_every_path() {
+        let rows = codes(9, (-64, 63), 3);
+        let columns = vec![[0; SKETCH_LEN]; 40];
+        // A score of i16::MIN is none.
+        let bases: Vec<i16> = (0..40).map(|k| if k % 16 == 3 { 5 } else { i16::MIN }).collect();
+        for &path in SweepPath::available() {
+            for found in closest::<4>(&rows, &Guessed::new(&columns, path), &bases) {
+                assert_eq!(found, [3, 19, NOBODY, NOBODY], "{}", path.name());
             }
         }
     }

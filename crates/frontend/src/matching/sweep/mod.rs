@@ -11,6 +11,8 @@ mod avx2;
 #[cfg(target_arch = "x86_64")]
 mod avx512;
 pub(super) mod closest;
+#[cfg(target_arch = "x86_64")]
+mod closest_avx512;
 mod scalar;
 
 use std::ops::Range;
