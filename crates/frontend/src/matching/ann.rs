@@ -2,7 +2,7 @@
 
 use terrane_scene::DESCRIPTOR_LEN;
 
-use super::cells::{Cells, Image, Two, near};
+use super::cells::{Cells, Image, Two, gathered, near};
 use super::distance::Measured;
 use super::nearest::Nearest;
 use super::sketch::Sketches;
@@ -11,21 +11,28 @@ use super::sweep::SweepPath;
 /// Cells that each descriptor looks into: 0.993 of the matches of real pairs; 4 find 0.986, 6 find 0.996.
 const NUM_PROBES: usize = 5;
 
-/// What is kept of an image.
+/// What is kept of an image, sorted by cell.
 pub(super) struct Prepared {
     descriptors: Measured,
     sketches: Sketches,
     cells: Cells,
+    order: Vec<u32>,
 }
 
 impl Prepared {
-    pub(super) fn new(descriptors: Vec<[u8; DESCRIPTOR_LEN]>, path: SweepPath) -> Self {
-        let sketches = Sketches::new(&descriptors);
-        Self { cells: Cells::new(&sketches, path), sketches, descriptors: Measured::new(descriptors) }
+    pub(super) fn new(descriptors: &[[u8; DESCRIPTOR_LEN]], path: SweepPath) -> Self {
+        let (cells, sketches, order) = Cells::new(Sketches::new(descriptors), path);
+        Self { cells, sketches, descriptors: Measured::new(gathered(descriptors, &order)), order }
     }
 
+    /// In the order of [`Prepared::order`].
     pub(super) fn descriptors(&self) -> &[[u8; DESCRIPTOR_LEN]] {
         &self.descriptors.descriptors
+    }
+
+    /// Where each descriptor was among those given.
+    pub(super) fn order(&self) -> &[u32] {
+        &self.order
     }
 
     fn image(&self) -> Image<'_> {
@@ -33,7 +40,7 @@ impl Prepared {
     }
 }
 
-/// Nearest neighbours as far as they were found.
+/// Nearest neighbours as far as they were found, in the orders of both images.
 pub(super) fn nearest(first: &Prepared, second: &Prepared) -> Nearest {
     let (rows, columns) = near(first.image(), second.image(), NUM_PROBES);
     Nearest {

@@ -14,7 +14,7 @@ use std::ops::Range;
 
 use terrane_scene::DESCRIPTOR_LEN;
 
-use super::cells::{Cells, Image, Two, near};
+use super::cells::{Cells, Image, Two, gathered, near};
 use super::distance::{Measured, distances};
 use super::kernel::MatchKernel;
 use super::nearest::{Best, Nearest, Neighbour};
@@ -35,8 +35,9 @@ const LEAST_TIGHT: usize = 64;
 /// Cells in which each descriptor looks for a bound on its runner-up.
 const NUM_PROBES: usize = 2;
 
-/// What the cascade keeps of an image.
+/// What the cascade keeps of an image, sorted by cell.
 pub(super) struct Prepared {
+    order: Vec<u32>,
     descriptors: Measured,
     cells: Cells,
     sketches: Sketches,
@@ -54,11 +55,12 @@ pub(super) struct CascadePaths {
 }
 
 impl Prepared {
-    pub(super) fn new(paths: CascadePaths, descriptors: Vec<[u8; DESCRIPTOR_LEN]>) -> Self {
-        let sketches = Sketches::new(&descriptors);
-        let descriptors = Measured::new(descriptors);
+    pub(super) fn new(paths: CascadePaths, descriptors: &[[u8; DESCRIPTOR_LEN]]) -> Self {
+        let (cells, sketches, order) = Cells::new(Sketches::new(descriptors), paths.sweep);
+        let descriptors = Measured::new(gathered(descriptors, &order));
         Self {
-            cells: Cells::new(&sketches, paths.sweep),
+            order,
+            cells,
             sweep_rows: paths.sweep.rows(&sketches.coarse.codes),
             sweep_columns: paths.sweep.columns(&sketches.fine.codes),
             sketches,
@@ -68,8 +70,14 @@ impl Prepared {
         }
     }
 
+    /// In the order of [`Prepared::order`].
     pub(super) fn descriptors(&self) -> &[[u8; DESCRIPTOR_LEN]] {
         &self.descriptors.descriptors
+    }
+
+    /// Where each descriptor was among those given.
+    pub(super) fn order(&self) -> &[u32] {
+        &self.order
     }
 
     fn image(&self) -> Image<'_> {
@@ -77,7 +85,7 @@ impl Prepared {
     }
 }
 
-/// Nearest neighbours as far as they matter to matches, which are as among all; others have none. `None` where bounds
+/// Nearest neighbours as far as they matter to matches, in the orders of both images; others have none. `None` where bounds
 /// are of no use and all products are to be computed.
 pub(super) fn nearest(
     paths: CascadePaths,

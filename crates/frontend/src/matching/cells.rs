@@ -1,6 +1,8 @@
 //! One image's descriptors in cells around some of them, to find near ones of another image quickly: an inverted file
 //! (Sivic & Zisserman 2003). What it finds is not always the nearest, but bounds how far the nearest are.
 
+use std::ops::Range;
+
 use super::distance::{Measured, distances};
 use super::nearest::Neighbour;
 use super::sketch::Sketches;
@@ -16,6 +18,8 @@ const GUESSES: usize = 2;
 pub(super) const MOST_PROBES: usize = 6;
 
 /// Cells of an image. Leaders are descriptors at equal steps; each descriptor goes to the leader that seems nearest.
+///
+/// Descriptors are sorted by cell, so that what is looked at together lies together.
 pub(super) struct Cells {
     leaders: Vec<u32>,
     leaders_guessed: Guessed,
@@ -23,11 +27,11 @@ pub(super) struct Cells {
 }
 
 struct Cell {
-    members: Vec<u32>,
+    members: Range<usize>,
     guessed: Guessed,
 }
 
-/// What is searched and searched for.
+/// What is searched and searched for, in the order of the cells.
 #[derive(Clone, Copy)]
 pub(super) struct Image<'a> {
     pub(super) descriptors: &'a Measured,
@@ -36,22 +40,31 @@ pub(super) struct Image<'a> {
 }
 
 impl Cells {
-    pub(super) fn new(sketches: &Sketches, path: SweepPath) -> Self {
-        let len = sketches.fine.codes.len();
+    /// Sorts sketches by cell, of each cell in rising order; with where each of them was before.
+    pub(super) fn new(sketches: Sketches, path: SweepPath) -> (Self, Sketches, Vec<u32>) {
+        let len = sketches.len();
         let num_leaders = len.div_ceil(CELL_SIZE);
         let leaders: Vec<u32> = (0..num_leaders).map(|at| (at * len / num_leaders) as u32).collect();
-        let guessed = |of: &[u32]| Guessed::new(&gathered(&sketches.fine.codes, of), path);
-        let leaders_guessed = guessed(&leaders);
-        let mut members = vec![Vec::new(); num_leaders];
-        let bases = sketches.score_bases(sketches);
-        let nearest = closest::<1>(&sketches.coarse.codes, &leaders_guessed, &gathered(&bases, &leaders));
-        for (at, found) in nearest.iter().enumerate() {
-            if let Some(cell) = members.get_mut(found[0] as usize) {
-                cell.push(at as u32);
-            }
-        }
-        let cell = |members: Vec<u32>| Cell { guessed: guessed(&members), members };
-        Self { leaders, leaders_guessed, cells: members.into_iter().map(cell).collect() }
+        let leaders_guessed = Guessed::new(&gathered(&sketches.fine.codes, &leaders), path);
+        let bases = gathered(&sketches.score_bases(&sketches), &leaders);
+        let nearest = closest::<1>(&sketches.coarse.codes, &leaders_guessed, &bases);
+        let arrivals = Arrivals::new(&nearest, 1, num_leaders);
+        // Nobody's member comes last.
+        let strays = (0..len as u32).filter(|&at| nearest[at as usize] == [NOBODY]);
+        let order: Vec<u32> = arrivals.all.iter().copied().chain(strays).collect();
+        let mut place_of = vec![0; len];
+        order.iter().zip(0..).for_each(|(&at, place)| place_of[at as usize] = place);
+        let sorted = sketches.in_order(&order);
+        let cell = |members: Range<usize>| Cell {
+            guessed: Guessed::new(&sorted.fine.codes[members.clone()], path),
+            members,
+        };
+        let cells = Self {
+            leaders: gathered(&place_of, &leaders),
+            leaders_guessed,
+            cells: arrivals.ranges().map(cell).collect(),
+        };
+        (cells, sorted, order)
     }
 }
 
@@ -71,15 +84,14 @@ fn probe(from: Image<'_>, into: Image<'_>, num_probes: usize, from_best: &mut [T
     let leader_bases = gathered(&bases, &into.cells.leaders);
     let leaders = closest::<MOST_PROBES>(codes, &into.cells.leaders_guessed, &leader_bases);
     let arrivals = Arrivals::new(&leaders, num_probes, into.cells.cells.len());
-    let (mut rows, mut columns, mut pairs, mut squared) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut rows, mut pairs, mut squared) = (Vec::new(), Vec::new(), Vec::new());
     for (cell, arrivals) in into.cells.cells.iter().zip(arrivals.by_cell()) {
         gather(codes, arrivals, &mut rows);
-        gather(&bases, &cell.members, &mut columns);
-        let guesses = closest::<GUESSES>(&rows, &cell.guessed, &columns);
+        let guesses = closest::<GUESSES>(&rows, &cell.guessed, &bases[cell.members.clone()]);
         pairs.clear();
         for (&at, guesses) in arrivals.iter().zip(&guesses) {
             let known = guesses.iter().filter(|&&guess| guess != NOBODY);
-            pairs.extend(known.map(|&guess| (at, cell.members[guess as usize])));
+            pairs.extend(known.map(|&guess| (at, cell.members.start as u32 + guess)));
         }
         distances(from.descriptors, into.descriptors, &pairs, &mut squared);
         for (&(a, b), &distance) in pairs.iter().zip(&squared) {
@@ -119,8 +131,13 @@ impl Arrivals {
         Self { starts, all }
     }
 
+    /// Where each cell's are among all.
+    fn ranges(&self) -> impl Iterator<Item = Range<usize>> {
+        self.starts.windows(2).map(|bounds| bounds[0] as usize..bounds[1] as usize)
+    }
+
     fn by_cell(&self) -> impl Iterator<Item = &[u32]> {
-        self.starts.windows(2).map(|bounds| &self.all[bounds[0] as usize..bounds[1] as usize])
+        self.ranges().map(|range| &self.all[range])
     }
 }
 
@@ -159,7 +176,7 @@ impl Two {
     }
 }
 
-fn gathered<T: Copy>(all: &[T], at: &[u32]) -> Vec<T> {
+pub(super) fn gathered<T: Copy>(all: &[T], at: &[u32]) -> Vec<T> {
     let mut out = Vec::new();
     gather(all, at, &mut out);
     out

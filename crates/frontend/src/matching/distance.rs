@@ -17,14 +17,20 @@ pub(super) struct Measured {
     /// Whether no byte of it exceeds 127: two products of such bytes fit in i16.
     #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
     narrow: Vec<bool>,
+    /// Squared length of each, less what a product gains when 128 is taken from each byte of the other side, twice.
+    #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
+    shifted_norms: Vec<i32>,
 }
 
 impl Measured {
     pub(super) fn new(descriptors: Vec<Descriptor>) -> Self {
         let norm = |descriptor: &Descriptor| descriptor.iter().map(|&byte| i32::from(byte).pow(2)).sum();
         let is_narrow = |descriptor: &Descriptor| descriptor.iter().all(|&byte| byte <= 127);
+        let sum = |descriptor: &Descriptor| descriptor.iter().map(|&byte| i32::from(byte)).sum::<i32>();
+        let norms: Vec<i32> = descriptors.iter().map(norm).collect();
         Self {
-            norms: descriptors.iter().map(norm).collect(),
+            shifted_norms: descriptors.iter().zip(&norms).map(|(of, norm)| norm - 256 * sum(of)).collect(),
+            norms,
             narrow: descriptors.iter().map(is_narrow).collect(),
             descriptors,
         }
@@ -39,6 +45,11 @@ impl Measured {
 pub(super) fn distances(first: &Measured, second: &Measured, pairs: &[(u32, u32)], distances: &mut Vec<i32>) {
     distances.clear();
     distances.reserve(pairs.len());
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512vnni") {
+        // SAFETY: the processor has AVX-512 F and VNNI.
+        return unsafe { distances_avx512(first, second, pairs, distances) };
+    }
     #[cfg(target_arch = "x86_64")]
     if is_x86_feature_detected!("avx2") {
         // SAFETY: the processor has AVX2.
@@ -64,6 +75,72 @@ fn distances_avx2(first: &Measured, second: &Measured, pairs: &[(u32, u32)], dis
         };
         distances.push(first.norms[a] + second.norms[b] - 2 * dot);
     }
+}
+
+/// Pairs whose products are summed up side by side.
+#[cfg(target_arch = "x86_64")]
+const TOGETHER: usize = 16;
+
+/// Bytes of the second side, less 128, are what `vpdpbusd` wants: signed.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512vnni")]
+fn distances_avx512(first: &Measured, second: &Measured, pairs: &[(u32, u32)], distances: &mut Vec<i32>) {
+    for (at, together) in pairs.chunks(TOGETHER).enumerate() {
+        for &(a, b) in pairs.iter().skip((at + 1) * TOGETHER).take(TOGETHER) {
+            fetch(&first.descriptors[a as usize]);
+            fetch(&second.descriptors[b as usize]);
+        }
+        let mut sums = [_mm512_setzero_si512(); TOGETHER];
+        for (sum, &(a, b)) in sums.iter_mut().zip(together) {
+            *sum = products(&first.descriptors[a as usize], &second.descriptors[b as usize]);
+        }
+        let mut dots = [0; TOGETHER];
+        // SAFETY: `dots` is 64 bytes long, and the store needs no alignment.
+        unsafe { _mm512_storeu_si512(dots.as_mut_ptr().cast(), totals(sums)) };
+        let distance = |(&(a, b), dot): (&(u32, u32), i32)| {
+            first.shifted_norms[a as usize] + second.norms[b as usize] - 2 * dot
+        };
+        distances.extend(together.iter().zip(dots).map(distance));
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f,avx512vnni")]
+#[inline]
+fn products(a: &Descriptor, b: &Descriptor) -> __m512i {
+    let turn = _mm512_set1_epi8(i8::MIN);
+    let mut sum = _mm512_setzero_si512();
+    for (a, b) in a.as_chunks::<64>().0.iter().zip(b.as_chunks::<64>().0) {
+        // SAFETY: both references cover 64 bytes, and the loads need no alignment.
+        let (a, b) =
+            unsafe { (_mm512_loadu_si512(a.as_ptr().cast()), _mm512_loadu_si512(b.as_ptr().cast())) };
+        sum = _mm512_dpbusd_epi32(sum, a, _mm512_xor_si512(b, turn));
+    }
+    sum
+}
+
+/// The sum of each register's lanes.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f")]
+#[inline]
+fn totals(sums: [__m512i; TOGETHER]) -> __m512i {
+    let quarters: [__m512i; 4] = std::array::from_fn(|k| {
+        let [a, b, c, d] = [sums[4 * k], sums[4 * k + 1], sums[4 * k + 2], sums[4 * k + 3]];
+        // Two of each register, by turns; then one of each of four, in each quarter of a register.
+        let ab = _mm512_add_epi32(_mm512_unpacklo_epi32(a, b), _mm512_unpackhi_epi32(a, b));
+        let cd = _mm512_add_epi32(_mm512_unpacklo_epi32(c, d), _mm512_unpackhi_epi32(c, d));
+        _mm512_add_epi32(_mm512_unpacklo_epi64(ab, cd), _mm512_unpackhi_epi64(ab, cd))
+    });
+    let [a, b, c, d] = quarters;
+    add_quarters(add_quarters(a, b), add_quarters(c, d))
+}
+
+/// Sums of neighbouring quarters: those of `a`, then those of `b`.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx512f")]
+#[inline]
+fn add_quarters(a: __m512i, b: __m512i) -> __m512i {
+    _mm512_add_epi32(_mm512_shuffle_i32x4::<0b10_00_10_00>(a, b), _mm512_shuffle_i32x4::<0b11_01_11_01>(a, b))
 }
 
 /// Pairs between a descriptor's fetching and its use.

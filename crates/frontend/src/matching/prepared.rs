@@ -33,17 +33,27 @@ impl PreparedImage {
                 let (rows, columns) = (kernel.pack_rows(&descriptors), kernel.pack_columns(&descriptors));
                 Kind::Exact { descriptors, rows, columns }
             }
-            Matcher::Cascade => Kind::Cascade(Box::new(Prepared::new(paths(), descriptors))),
-            Matcher::Ann => Kind::Ann(Box::new(ann::Prepared::new(descriptors, paths().sweep))),
+            Matcher::Cascade => Kind::Cascade(Box::new(Prepared::new(paths(), &descriptors))),
+            Matcher::Ann => Kind::Ann(Box::new(ann::Prepared::new(&descriptors, paths().sweep))),
         })
     }
 
+    /// In the order of [`PreparedImage::order`].
     fn descriptors(&self) -> &[[u8; DESCRIPTOR_LEN]] {
         match &self.0 {
             Kind::Exact { descriptors, .. } => descriptors,
             Kind::Cascade(prepared) => prepared.descriptors(),
             Kind::Ann(prepared) => prepared.descriptors(),
             Kind::Bits(_) => &[],
+        }
+    }
+
+    /// Where each descriptor was among those given; `None` where it still is there.
+    fn order(&self) -> Option<&[u32]> {
+        match &self.0 {
+            Kind::Cascade(prepared) => Some(prepared.order()),
+            Kind::Ann(prepared) => Some(prepared.order()),
+            Kind::Exact { .. } | Kind::Bits(_) => None,
         }
     }
 }
@@ -61,7 +71,18 @@ pub fn match_prepared(first: &PreparedImage, second: &PreparedImage, options: &M
         (Kind::Ann(first), Kind::Ann(second)) => ann::nearest(first, second),
         _ => MatchKernel::fastest().nearest(first.descriptors(), second.descriptors()),
     };
-    matches_of(&nearest, first.descriptors(), second.descriptors(), options)
+    let matches = matches_of(&nearest, first.descriptors(), second.descriptors(), options);
+    as_given(matches, first.order(), second.order())
+}
+
+/// Matches of images in these orders, as those of the images as they were given.
+pub(super) fn as_given(mut matches: Vec<Match>, first: Option<&[u32]>, second: Option<&[u32]>) -> Vec<Match> {
+    let place = |order: Option<&[u32]>, at: u32| order.map_or(at, |order| order[at as usize]);
+    for found in &mut matches {
+        (found.first, found.second) = (place(first, found.first), place(second, found.second));
+    }
+    matches.sort_unstable_by_key(|found| found.first);
+    matches
 }
 
 /// The cascade's neighbours, or all where bounds are of no use.

@@ -11,6 +11,7 @@
 
 use terrane_scene::DESCRIPTOR_LEN;
 
+use super::cells::gathered;
 use super::sweep::ANY_REACH;
 
 /// Numbers of a sketch.
@@ -119,6 +120,19 @@ impl Sketches {
         }
     }
 
+    pub(super) fn len(&self) -> usize {
+        self.squared.len()
+    }
+
+    /// Those at `order`, one after another.
+    pub(super) fn in_order(&self, order: &[u32]) -> Self {
+        Self {
+            coarse: self.coarse.in_order(order),
+            fine: self.fine.in_order(order),
+            squared: gathered(&self.squared, order),
+        }
+    }
+
     /// The bases of this image's limits where it has the rows and another image the columns; [`LOOSE`] where rounding
     /// has taken too much for bounds to be of use.
     pub(super) fn row_bases(&self, columns: &Self) -> Vec<i32> {
@@ -180,6 +194,15 @@ impl Codes {
             codes,
             squared,
             lost,
+        }
+    }
+
+    fn in_order(&self, order: &[u32]) -> Self {
+        Self {
+            codes: gathered(&self.codes, order),
+            squared: gathered(&self.squared, order),
+            lost: gathered(&self.lost, order),
+            ..*self
         }
     }
 }

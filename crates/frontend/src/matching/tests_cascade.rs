@@ -3,6 +3,7 @@
 
 use super::cascade::{self, CascadePaths, Prepared};
 use super::distance::{Measured, distances};
+use super::prepared::as_given;
 use super::sketch::{LOOSE, Sketches};
 use super::sweep::{ANY_REACH, Limits, NO_REACH, SweepPath, sweep};
 use super::tests::features;
@@ -69,9 +70,12 @@ fn assert_equal(first: &[Descriptor], second: &[Descriptor], options: &MatchOpti
     let truth = matches_of(&MatchKernel::fastest().nearest(first, second), first, second, options);
     let mut of_use = true;
     for paths in all_paths() {
-        let (a, b) = (Prepared::new(paths, first.to_vec()), Prepared::new(paths, second.to_vec()));
+        let (a, b) = (Prepared::new(paths, first), Prepared::new(paths, second));
         match cascade::nearest(paths, &a, &b, options) {
-            Some(nearest) => assert_eq!(matches_of(&nearest, first, second, options), truth, "{paths:?}"),
+            Some(nearest) => {
+                let found = matches_of(&nearest, a.descriptors(), b.descriptors(), options);
+                assert_eq!(as_given(found, Some(a.order()), Some(b.order())), truth, "{paths:?}");
+            }
             None => of_use = false,
         }
     }
@@ -237,15 +241,17 @@ fn approximate_matches_are_mostly_the_exact_ones() {
     let second = seen_again(&first, 18);
     let options = MatchOptions::default();
     let truth = matches_of(&MatchKernel::fastest().nearest(&first, &second), &first, &second, &options);
-    let nearest = |path: SweepPath| {
-        let prepared = |descriptors: &[Descriptor]| ann::Prepared::new(descriptors.to_vec(), path);
-        ann::nearest(&prepared(&first), &prepared(&second))
+    let of_path = |path: SweepPath| {
+        let (a, b) = (ann::Prepared::new(&first, path), ann::Prepared::new(&second, path));
+        let nearest = ann::nearest(&a, &b);
+        let found = matches_of(&nearest, a.descriptors(), b.descriptors(), &options);
+        (nearest, as_given(found, Some(a.order()), Some(b.order())))
     };
-    let scalar = nearest(SweepPath::Scalar);
+    let scalar = of_path(SweepPath::Scalar);
     for &path in SweepPath::available() {
-        assert_eq!(nearest(path), scalar, "{}", path.name());
+        assert_eq!(of_path(path), scalar, "{}", path.name());
     }
-    let found = matches_of(&scalar, &first, &second, &options);
+    let found = scalar.1;
     let pairs = |matches: &[Match]| matches.iter().map(|m| (m.first, m.second)).collect::<Vec<_>>();
     let truth = pairs(&truth);
     let right = pairs(&found).iter().filter(|pair| truth.contains(pair)).count();

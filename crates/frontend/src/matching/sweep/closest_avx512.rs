@@ -1,4 +1,4 @@
-//! AVX-512 VNNI: the closest columns, tiles of eight rows by 32 columns.
+//! AVX-512 VNNI: the closest columns, tiles of four rows by 32 columns.
 //!
 //! Sums are taken in 32 bits, as in the sweep of this path, and cut to 16 once a tile: scores are defined modulo 2¹⁶. Even lanes
 //! lie in one register and odd ones in the other, so that cutting them is one shift and one blend and keeps their order.
@@ -9,7 +9,7 @@ use super::avx512::load;
 use super::closest::{LANES, NOBODY};
 use crate::matching::sketch::{Code, SKETCH_LEN};
 
-const ROWS: usize = 8;
+const ROWS: usize = 4;
 /// The i32 lanes of a register.
 const WIDTH: usize = 16;
 const QUADS: usize = SKETCH_LEN / 4;
