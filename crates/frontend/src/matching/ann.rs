@@ -2,7 +2,7 @@
 
 use terrane_scene::DESCRIPTOR_LEN;
 
-use super::cells::{Cells, Image, Two, gathered, near};
+use super::cells::{Cells, Image, Two, near};
 use super::distance::Measured;
 use super::nearest::Nearest;
 use super::sketch::Sketches;
@@ -22,12 +22,12 @@ pub(super) struct Prepared {
 impl Prepared {
     pub(super) fn new(descriptors: &[[u8; DESCRIPTOR_LEN]], path: SweepPath) -> Self {
         let (cells, sketches, order) = Cells::new(Sketches::new(descriptors), path);
-        Self { cells, sketches, descriptors: Measured::new(gathered(descriptors, &order)), order }
+        Self { cells, sketches, descriptors: Measured::new(descriptors, &order), order }
     }
 
     /// In the order of [`Prepared::order`].
     pub(super) fn descriptors(&self) -> &[[u8; DESCRIPTOR_LEN]] {
-        &self.descriptors.descriptors
+        self.descriptors.descriptors()
     }
 
     /// Where each descriptor was among those given.

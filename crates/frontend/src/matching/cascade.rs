@@ -14,7 +14,7 @@ use std::ops::Range;
 
 use terrane_scene::DESCRIPTOR_LEN;
 
-use super::cells::{Cells, Image, Two, gathered, near};
+use super::cells::{Cells, Image, Two, near};
 use super::distance::{Measured, distances};
 use super::kernel::MatchKernel;
 use super::nearest::{Best, Nearest, Neighbour};
@@ -57,7 +57,7 @@ pub(super) struct CascadePaths {
 impl Prepared {
     pub(super) fn new(paths: CascadePaths, descriptors: &[[u8; DESCRIPTOR_LEN]]) -> Self {
         let (cells, sketches, order) = Cells::new(Sketches::new(descriptors), paths.sweep);
-        let descriptors = Measured::new(gathered(descriptors, &order));
+        let descriptors = Measured::new(descriptors, &order);
         Self {
             order,
             cells,
@@ -72,7 +72,7 @@ impl Prepared {
 
     /// In the order of [`Prepared::order`].
     pub(super) fn descriptors(&self) -> &[[u8; DESCRIPTOR_LEN]] {
-        &self.descriptors.descriptors
+        self.descriptors.descriptors()
     }
 
     /// Where each descriptor was among those given.

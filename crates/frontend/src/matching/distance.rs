@@ -9,9 +9,14 @@ use super::scalar;
 
 type Descriptor = [u8; DESCRIPTOR_LEN];
 
+/// A descriptor that fills two lines of the cache.
+#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C, align(64))]
+struct Aligned(Descriptor);
+
 /// Descriptors with what speeds up their distances.
 pub(super) struct Measured {
-    pub(super) descriptors: Vec<Descriptor>,
+    descriptors: Vec<Aligned>,
     /// Squared length of each.
     pub(super) norms: Vec<i32>,
     /// Whether no byte of it exceeds 127: two products of such bytes fit in i16.
@@ -23,10 +28,12 @@ pub(super) struct Measured {
 }
 
 impl Measured {
-    pub(super) fn new(descriptors: Vec<Descriptor>) -> Self {
-        let norm = |descriptor: &Descriptor| descriptor.iter().map(|&byte| i32::from(byte).pow(2)).sum();
-        let is_narrow = |descriptor: &Descriptor| descriptor.iter().all(|&byte| byte <= 127);
-        let sum = |descriptor: &Descriptor| descriptor.iter().map(|&byte| i32::from(byte)).sum::<i32>();
+    /// Of the descriptors at `order`, one after another.
+    pub(super) fn new(descriptors: &[Descriptor], order: &[u32]) -> Self {
+        let descriptors: Vec<Aligned> = order.iter().map(|&at| Aligned(descriptors[at as usize])).collect();
+        let norm = |descriptor: &Aligned| descriptor.0.iter().map(|&byte| i32::from(byte).pow(2)).sum();
+        let is_narrow = |descriptor: &Aligned| descriptor.0.iter().all(|&byte| byte <= 127);
+        let sum = |descriptor: &Aligned| descriptor.0.iter().map(|&byte| i32::from(byte)).sum::<i32>();
         let norms: Vec<i32> = descriptors.iter().map(norm).collect();
         Self {
             shifted_norms: descriptors.iter().zip(&norms).map(|(of, norm)| norm - 256 * sum(of)).collect(),
@@ -38,6 +45,15 @@ impl Measured {
 
     pub(super) fn len(&self) -> usize {
         self.descriptors.len()
+    }
+
+    pub(super) fn descriptors(&self) -> &[Descriptor] {
+        bytemuck::must_cast_slice(&self.descriptors)
+    }
+
+    #[inline]
+    pub(super) fn at(&self, at: u32) -> &Descriptor {
+        &self.descriptors[at as usize].0
     }
 }
 
@@ -55,9 +71,7 @@ pub(super) fn distances(first: &Measured, second: &Measured, pairs: &[(u32, u32)
         // SAFETY: the processor has AVX2.
         return unsafe { distances_avx2(first, second, pairs, distances) };
     }
-    distances.extend(pairs.iter().map(|&(a, b)| {
-        scalar::distance_squared(&first.descriptors[a as usize], &second.descriptors[b as usize])
-    }));
+    distances.extend(pairs.iter().map(|&(a, b)| scalar::distance_squared(first.at(a), second.at(b))));
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -65,15 +79,14 @@ pub(super) fn distances(first: &Measured, second: &Measured, pairs: &[(u32, u32)
 fn distances_avx2(first: &Measured, second: &Measured, pairs: &[(u32, u32)], distances: &mut Vec<i32>) {
     for (at, &(a, b)) in pairs.iter().enumerate() {
         if let Some(&(a, b)) = pairs.get(at + AHEAD) {
-            fetch(&first.descriptors[a as usize]);
-            fetch(&second.descriptors[b as usize]);
+            fetch(first.at(a));
+            fetch(second.at(b));
         }
-        let (a, b) = (a as usize, b as usize);
-        let dot = match first.narrow[a] && second.narrow[b] {
-            true => dot_narrow(&first.descriptors[a], &second.descriptors[b]),
-            false => dot_wide(&first.descriptors[a], &second.descriptors[b]),
+        let dot = match first.narrow[a as usize] && second.narrow[b as usize] {
+            true => dot_narrow(first.at(a), second.at(b)),
+            false => dot_wide(first.at(a), second.at(b)),
         };
-        distances.push(first.norms[a] + second.norms[b] - 2 * dot);
+        distances.push(first.norms[a as usize] + second.norms[b as usize] - 2 * dot);
     }
 }
 
@@ -87,12 +100,12 @@ const TOGETHER: usize = 16;
 fn distances_avx512(first: &Measured, second: &Measured, pairs: &[(u32, u32)], distances: &mut Vec<i32>) {
     for (at, together) in pairs.chunks(TOGETHER).enumerate() {
         for &(a, b) in pairs.iter().skip((at + 1) * TOGETHER).take(TOGETHER) {
-            fetch(&first.descriptors[a as usize]);
-            fetch(&second.descriptors[b as usize]);
+            fetch(first.at(a));
+            fetch(second.at(b));
         }
         let mut sums = [_mm512_setzero_si512(); TOGETHER];
         for (sum, &(a, b)) in sums.iter_mut().zip(together) {
-            *sum = products(&first.descriptors[a as usize], &second.descriptors[b as usize]);
+            *sum = products(first.at(a), second.at(b));
         }
         let mut dots = [0; TOGETHER];
         // SAFETY: `dots` is 64 bytes long, and the store needs no alignment.
@@ -194,4 +207,42 @@ fn total(sum: __m256i) -> i32 {
     let two = _mm_add_epi32(four, _mm_shuffle_epi32::<0b01_00_11_10>(four));
     let one = _mm_add_epi32(two, _mm_shuffle_epi32::<0b10_11_00_01>(two));
     _mm_cvtsi128_si32(one)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::RngExt;
+    use terrane_geometry::Seed;
+
+    use super::*;
+
+    #[test]
+    fn distances_are_those_of_the_oracle_on_every_path() {
+        let mut rng = Seed(15).rng();
+        let mut all: Vec<Descriptor> = Vec::new();
+        for limit in [127, 255] {
+            all.extend(
+                (0..20).map(|_| -> Descriptor { std::array::from_fn(|_| rng.random_range(0..=limit)) }),
+            );
+        }
+        all.extend([0, 255, 127, 128].map(|byte| [byte; DESCRIPTOR_LEN]));
+        // No multiple of what is summed up together.
+        let pairs: Vec<(u32, u32)> =
+            (0..44).flat_map(|a| (0..44).map(move |b| (a, b))).chain([(3, 5), (43, 41), (0, 0)]).collect();
+        let measured = Measured::new(&all, &(0..44).collect::<Vec<_>>());
+        let truth: Vec<i32> = pairs
+            .iter()
+            .map(|&(a, b)| scalar::distance_squared(&all[a as usize], &all[b as usize]))
+            .collect();
+        let mut found = Vec::new();
+        distances(&measured, &measured, &pairs, &mut found);
+        assert_eq!(found, truth);
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") {
+            found.clear();
+            // SAFETY: the processor has AVX2.
+            unsafe { distances_avx2(&measured, &measured, &pairs, &mut found) };
+            assert_eq!(found, truth);
+        }
+    }
 }

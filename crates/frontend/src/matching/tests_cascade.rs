@@ -2,7 +2,6 @@
 //! bounds; the sweeps against their oracle; what the approximate matcher finds.
 
 use super::cascade::{self, CascadePaths, Prepared};
-use super::distance::{Measured, distances};
 use super::prepared::as_given;
 use super::sketch::{LOOSE, Sketches};
 use super::sweep::{ANY_REACH, Limits, NO_REACH, SweepPath, sweep};
@@ -207,20 +206,6 @@ fn sweeps_agree_with_their_oracle() {
         for &path in SweepPath::available() {
             assert_eq!(survivors(path), truth, "{}", path.name());
         }
-    }
-}
-
-#[test]
-fn single_distances_are_those_of_the_oracle() {
-    let mut all = random(20, 127, 15);
-    all.extend(random(20, 255, 16));
-    all.extend([[0; DESCRIPTOR_LEN], [255; DESCRIPTOR_LEN], [127; DESCRIPTOR_LEN], [128; DESCRIPTOR_LEN]]);
-    let pairs: Vec<(u32, u32)> = (0..44).flat_map(|a| (0..44).map(move |b| (a, b))).collect();
-    let measured = Measured::new(all.clone());
-    let mut found = Vec::new();
-    distances(&measured, &measured, &pairs, &mut found);
-    for (&(a, b), &distance) in pairs.iter().zip(&found) {
-        assert_eq!(distance, scalar::distance_squared(&all[a as usize], &all[b as usize]));
     }
 }
 

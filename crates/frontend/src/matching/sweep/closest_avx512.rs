@@ -18,18 +18,20 @@ const OFFSET: i8 = 64;
 /// The odd ones of 32 lanes.
 const ODD: u32 = 0xaaaa_aaaa;
 
-type Quads = [[i32; WIDTH]; 2];
+/// A word for each of 32 columns: the even ones, then the odd ones.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+struct Words([[i32; WIDTH]; 2]);
+
 type Row = [i32; QUADS];
 
-/// Four entries of 32 columns side by side: the even ones, then the odd ones.
-#[derive(Clone)]
-#[repr(C, align(64))]
-struct Block([Quads; QUADS]);
+/// Four entries of 32 columns side by side.
+type Block = [Words; QUADS];
 
 pub(in crate::matching) struct Columns {
     blocks: Vec<Block>,
     /// What the rows' offset adds to each column's scores, negated.
-    starts: Vec<Quads>,
+    starts: Vec<Words>,
     len: usize,
 }
 
@@ -40,25 +42,25 @@ pub(super) fn is_available() -> bool {
 impl Columns {
     pub(super) fn new(codes: &[Code]) -> Self {
         let num_blocks = codes.len().div_ceil(LANES);
-        let mut blocks = vec![Block([[[0; WIDTH]; 2]; QUADS]); num_blocks];
-        let mut starts = vec![[[0; WIDTH]; 2]; num_blocks];
+        let mut blocks = vec![[Words([[0; WIDTH]; 2]); QUADS]; num_blocks];
+        let mut starts = vec![Words([[0; WIDTH]; 2]); num_blocks];
         for (at, code) in codes.iter().enumerate() {
             let (block, parity, lane) = (at / LANES, at % 2, at % LANES / 2);
             for (quad, entries) in code.as_chunks::<4>().0.iter().enumerate() {
-                blocks[block].0[quad][parity][lane] = i32::from_le_bytes(entries.map(|entry| entry as u8));
+                blocks[block][quad].0[parity][lane] = i32::from_le_bytes(entries.map(|entry| entry as u8));
             }
             let sum: i32 = code.iter().map(|&entry| i32::from(entry)).sum();
-            starts[block][parity][lane] = -i32::from(OFFSET) * sum;
+            starts[block].0[parity][lane] = -i32::from(OFFSET) * sum;
         }
         Self { blocks, starts, len: codes.len() }
     }
 
     /// Where the sums of each column begin. An absent column's score is never better than none.
-    fn starts_at(&self, bases: &[i16]) -> Vec<Quads> {
-        let mut starts = vec![[[i32::from(i16::MIN); WIDTH]; 2]; self.starts.len()];
+    fn starts_at(&self, bases: &[i16]) -> Vec<Words> {
+        let mut starts = vec![Words([[i32::from(i16::MIN); WIDTH]; 2]); self.starts.len()];
         for (at, base) in bases.iter().enumerate() {
             let (block, parity, lane) = (at / LANES, at % 2, at % LANES / 2);
-            starts[block][parity][lane] = self.starts[block][parity][lane] - i32::from(*base);
+            starts[block].0[parity][lane] = self.starts[block].0[parity][lane] - i32::from(*base);
         }
         starts
     }
@@ -86,7 +88,7 @@ pub(super) fn closest<const N: usize>(rows: &[Code], columns: &Columns, bases: &
 fn best_of_lanes<const N: usize>(
     rows: &[Row; ROWS],
     blocks: &[Block],
-    starts: &[Quads],
+    starts: &[Words],
     found: &mut [[u32; N]],
 ) {
     let mut best = [_mm512_set1_epi16(i16::MIN); ROWS];
@@ -108,10 +110,10 @@ fn best_of_lanes<const N: usize>(
 
 #[target_feature(enable = "avx512f,avx512vnni")]
 #[inline]
-fn sums(rows: &[Row; ROWS], block: &Block, start: &Quads) -> [[__m512i; 2]; ROWS] {
-    let mut sums = [[load(&start[0]), load(&start[1])]; ROWS];
+fn sums(rows: &[Row; ROWS], block: &Block, start: &Words) -> [[__m512i; 2]; ROWS] {
+    let mut sums = [[load(&start.0[0]), load(&start.0[1])]; ROWS];
     for quad in 0..QUADS {
-        let columns = [load(&block.0[quad][0]), load(&block.0[quad][1])];
+        let columns = [load(&block[quad].0[0]), load(&block[quad].0[1])];
         for r in 0..ROWS {
             let row = _mm512_set1_epi32(rows[r][quad]);
             sums[r][0] = _mm512_dpbusd_epi32(sums[r][0], row, columns[0]);
