@@ -99,40 +99,54 @@ pub(crate) fn degree_ten_roots(c: &[f64; 11]) -> SmallVec<[f64; 10]> {
     let chain = SturmChain::new(&inside);
     let at = |x: f64| chain.sign_changes(x);
     let (below, above) = (at(-1.0), at(1.0));
-    isolate(&inside, &at, (-1.0, below), (1.0, above), &mut roots);
+    let mut brackets = SmallVec::new();
+    isolate(&inside, &at, (-1.0, below), (1.0, above), &mut brackets);
+    let num_inside = brackets.len();
     // In w = 1 / x the count falls where it grows in x.
     let at_inverse = |w: f64| MEMBERS - chain.sign_changes(1.0 / w);
-    let mut inverse = SmallVec::<[f64; 10]>::new();
     let (lowest, highest) = (chain.sign_changes_at_infinity(-1.0), chain.sign_changes_at_infinity(1.0));
-    isolate(&outside, &at_inverse, (-1.0, MEMBERS - below), (-TINY, MEMBERS - lowest), &mut inverse);
-    isolate(&outside, &at_inverse, (TINY, MEMBERS - highest), (1.0, MEMBERS - above), &mut inverse);
-    roots.extend(inverse.into_iter().filter(|w| w.abs() < 1.0 && *w != 0.0).map(|w| 1.0 / w));
+    isolate(&outside, &at_inverse, (-1.0, MEMBERS - below), (-TINY, MEMBERS - lowest), &mut brackets);
+    isolate(&outside, &at_inverse, (TINY, MEMBERS - highest), (1.0, MEMBERS - above), &mut brackets);
+    for (chunk, brackets) in brackets.chunks(ROOTS).enumerate() {
+        for (lane, root) in polish(brackets).into_iter().enumerate() {
+            match root {
+                Some(root) if chunk * ROOTS + lane < num_inside => roots.push(root),
+                Some(w) if w.abs() < 1.0 && w != 0.0 => roots.push(1.0 / w),
+                _ => {}
+            }
+        }
+    }
     roots.retain(|root| root.is_finite());
     roots
 }
 
-/// Bisects until each part holds one root of `c`, then polishes it; ends come with their sign changes.
-fn isolate(
-    c: &[f64; 11],
+/// Where a polynomial has one root.
+struct Bracket<'a> {
+    polynomial: &'a [f64; 11],
+    low: f64,
+    high: f64,
+}
+
+/// Bisects until each part holds one root of `c`; ends come with their sign changes.
+fn isolate<'a>(
+    c: &'a [f64; 11],
     sign_changes: &impl Fn(f64) -> usize,
     low: (f64, usize),
     high: (f64, usize),
-    roots: &mut SmallVec<[f64; 10]>,
+    brackets: &mut SmallVec<[Bracket<'a>; 10]>,
 ) {
     let count = low.1.saturating_sub(high.1);
     if count == 0 {
         return;
     }
     if count == 1 || high.0 - low.0 < 1e-12 {
-        if let Some(root) = polish(c, low.0, high.0) {
-            roots.push(root);
-        }
+        brackets.push(Bracket { polynomial: c, low: low.0, high: high.0 });
         return;
     }
     let middle = 0.5 * (low.0 + high.0);
     let middle = (middle, sign_changes(middle));
-    isolate(c, sign_changes, low, middle, roots);
-    isolate(c, sign_changes, middle, high, roots);
+    isolate(c, sign_changes, low, middle, brackets);
+    isolate(c, sign_changes, middle, high, brackets);
 }
 
 /// Members of a chain: that of degree ten, its derivative, and remainders.
@@ -246,45 +260,106 @@ fn negated_remainder(
     (rest.map(|value| -value), degree)
 }
 
-#[inline]
-fn evaluate(c: &[f64], x: f64) -> f64 {
-    c.iter().rev().fold(0.0, |sum, value| sum * x + value)
+/// Roots that are polished side by side: each is a chain of operations that wait for each other.
+const ROOTS: usize = 8;
+
+/// The roots between bounds of different sign by Newton's method, with bisection whenever it leaves them. As many as there are
+/// brackets, in their order, at most [`ROOTS`].
+fn polish(brackets: &[Bracket<'_>]) -> SmallVec<[Option<f64>; ROOTS]> {
+    let mut c = [[0.0; ROOTS]; 11];
+    let (mut low, mut high) = ([0.0; ROOTS], [0.0; ROOTS]);
+    for (lane, bracket) in brackets.iter().enumerate().take(ROOTS) {
+        (low[lane], high[lane]) = (bracket.low, bracket.high);
+        for (row, value) in c.iter_mut().zip(bracket.polynomial) {
+            row[lane] = *value;
+        }
+    }
+    let (at_low, at_high) = (evaluate(&c, &low).0, evaluate(&c, &high).0);
+    let ends = |lane: usize| -> Option<Option<f64>> {
+        let (low, high) = (low[lane], high[lane]);
+        if at_low[lane] == 0.0 {
+            Some(Some(low))
+        } else if at_high[lane] == 0.0 {
+            Some(Some(high))
+        } else if at_low[lane] * at_high[lane] > 0.0 {
+            // A double root that rounding made two: its middle is as good as any.
+            Some((high - low < 1e-10).then_some(0.5 * (low + high)))
+        } else {
+            None
+        }
+    };
+    let at_ends: [_; ROOTS] = std::array::from_fn(ends);
+    let x = newton_on_path(&c, &at_low, (low, high), at_ends.map(|found| found.is_some()));
+    (0..brackets.len().min(ROOTS)).map(|lane| at_ends[lane].unwrap_or(Some(x[lane]))).collect()
 }
 
-/// The root between bounds of different sign by Newton's method, with bisection whenever it leaves them.
-fn polish(c: &[f64; 11], mut low: f64, mut high: f64) -> Option<f64> {
-    let (at_low, at_high) = (evaluate(c, low), evaluate(c, high));
-    if at_low == 0.0 {
-        return Some(low);
+/// [`newton`] by wider registers where the processor has them: the same operations, hence the same bits.
+fn newton_on_path(
+    c: &[[f64; ROOTS]; 11],
+    at_low: &[f64; ROOTS],
+    bounds: ([f64; ROOTS], [f64; ROOTS]),
+    done: [bool; ROOTS],
+) -> [f64; ROOTS] {
+    #[cfg(target_arch = "x86_64")]
+    {
+        #[target_feature(enable = "avx2")]
+        fn with_avx2(
+            c: &[[f64; ROOTS]; 11],
+            at_low: &[f64; ROOTS],
+            bounds: ([f64; ROOTS], [f64; ROOTS]),
+            done: [bool; ROOTS],
+        ) -> [f64; ROOTS] {
+            newton(c, at_low, bounds, done)
+        }
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2, as was just found.
+            return unsafe { with_avx2(c, at_low, bounds, done) };
+        }
     }
-    if at_high == 0.0 {
-        return Some(high);
-    }
-    if at_low * at_high > 0.0 {
-        // A double root that rounding made two: its middle is as good as any.
-        return (high - low < 1e-10).then_some(0.5 * (low + high));
-    }
-    let mut x = 0.5 * (low + high);
+    newton(c, at_low, bounds, done)
+}
+
+/// Newton's method in every lane that is not done.
+#[inline(always)]
+fn newton(
+    c: &[[f64; ROOTS]; 11],
+    at_low: &[f64; ROOTS],
+    (mut low, mut high): ([f64; ROOTS], [f64; ROOTS]),
+    mut done: [bool; ROOTS],
+) -> [f64; ROOTS] {
+    let mut x: [f64; ROOTS] = std::array::from_fn(|lane| 0.5 * (low[lane] + high[lane]));
     for _ in 0..60 {
-        let (mut value, mut slope) = (0.0, 0.0);
-        for coefficient in c.iter().rev() {
-            slope = slope * x + value;
-            value = value * x + coefficient;
+        let (value, slope) = evaluate(c, &x);
+        for l in 0..ROOTS {
+            let is_low = value[l] * at_low[l] > 0.0;
+            low[l] = if is_low { x[l] } else { low[l] };
+            high[l] = if is_low { high[l] } else { x[l] };
+            let newton = x[l] - value[l] / slope[l];
+            let middle = 0.5 * (low[l] + high[l]);
+            let next = if newton > low[l] && newton < high[l] { newton } else { middle };
+            // Newton's next step would be its square.
+            let is_near = (next - x[l]).abs() <= 1e-9 * (1.0 + x[l].abs());
+            x[l] = if done[l] { x[l] } else { next };
+            done[l] |= is_near;
         }
-        if value * at_low > 0.0 {
-            low = x
-        } else {
-            high = x
+        if done == [true; ROOTS] {
+            break;
         }
-        let newton = x - value / slope;
-        let next = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
-        // Newton's next step would be its square.
-        if (next - x).abs() <= 1e-9 * (1.0 + x.abs()) {
-            return Some(next);
-        }
-        x = next;
     }
-    Some(x)
+    x
+}
+
+/// The values and the slopes of the polynomial in each lane.
+#[inline(always)]
+fn evaluate(c: &[[f64; ROOTS]; 11], x: &[f64; ROOTS]) -> ([f64; ROOTS], [f64; ROOTS]) {
+    let (mut value, mut slope) = ([0.0; ROOTS], [0.0; ROOTS]);
+    for row in c.iter().rev() {
+        for l in 0..ROOTS {
+            slope[l] = slope[l] * x[l] + value[l];
+            value[l] = value[l] * x[l] + row[l];
+        }
+    }
+    (value, slope)
 }
 
 #[cfg(test)]

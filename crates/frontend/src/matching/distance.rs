@@ -32,7 +32,7 @@ impl Measured {
     pub(super) fn new(descriptors: &[Descriptor], order: &[u32]) -> Self {
         let descriptors: Vec<Aligned> = order.iter().map(|&at| Aligned(descriptors[at as usize])).collect();
         let norm = |descriptor: &Aligned| descriptor.0.iter().map(|&byte| i32::from(byte).pow(2)).sum();
-        let is_narrow = |descriptor: &Aligned| descriptor.0.iter().all(|&byte| byte <= 127);
+        let is_narrow = |descriptor: &Aligned| descriptor.0.iter().fold(0, |all, byte| all | byte) <= 127;
         let sum = |descriptor: &Aligned| descriptor.0.iter().map(|&byte| i32::from(byte)).sum::<i32>();
         let norms: Vec<i32> = descriptors.iter().map(norm).collect();
         Self {
