@@ -417,6 +417,22 @@ mod tests {
     }
 
     #[test]
+    fn both_compilations_polish_to_the_same_bits() {
+        let mut random = Random::new("polish");
+        for _ in 0..200 {
+            let c: [[f64; ROOTS]; 11] =
+                std::array::from_fn(|_| std::array::from_fn(|_| random.uniform(-1.0, 1.0)));
+            let bounds: [[f64; ROOTS]; 2] =
+                [-1.0, 0.3].map(|low| std::array::from_fn(|_| random.uniform(low, low + 0.7)));
+            let at_low = evaluate(&c, &bounds[0]).0;
+            let done = std::array::from_fn(|lane| lane == 3);
+            let plain = newton(&c, &at_low, (bounds[0], bounds[1]), done);
+            let found = newton_on_path(&c, &at_low, (bounds[0], bounds[1]), done);
+            assert_eq!(plain.map(f64::to_bits), found.map(f64::to_bits));
+        }
+    }
+
+    #[test]
     fn complex_pairs_are_left_out_and_far_roots_found() {
         let mut random = Random::new("sturm complex");
         for _ in 0..500 {

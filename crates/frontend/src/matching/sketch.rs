@@ -13,6 +13,7 @@ use terrane_scene::DESCRIPTOR_LEN;
 
 use super::cells::gathered;
 use super::sweep::ANY_REACH;
+use crate::simd::{Path, compiled_twice};
 
 /// Numbers of a sketch.
 pub(super) const SKETCH_LEN: usize = 32;
@@ -109,7 +110,8 @@ pub(super) struct Codes {
 
 impl Sketches {
     pub(super) fn new(descriptors: &[[u8; DESCRIPTOR_LEN]]) -> Self {
-        let mut sketches: Vec<[f32; SKETCH_LEN]> = descriptors.iter().map(sketch).collect();
+        let mut sketches = vec![[0.0; SKETCH_LEN]; descriptors.len()];
+        sketch_all(Path::detect(), descriptors, &mut sketches);
         let squared: Vec<f32> = sketches.iter().map(squared_length).collect();
         let unit = (root_mean(&squared) / (SKETCH_LEN as f32).sqrt() / TYPICAL_ENTRY).max(LEAST_UNIT);
         sketches.iter_mut().for_each(turn);
@@ -242,8 +244,20 @@ fn turn(values: &mut [f32; SKETCH_LEN]) {
     values.iter_mut().for_each(|value| *value *= SCALE);
 }
 
+compiled_twice!(
+    sketch_all = sketch_all_body(descriptors: &[[u8; DESCRIPTOR_LEN]], sketches: &mut [[f32; SKETCH_LEN]])
+);
+
+#[inline(always)]
+fn sketch_all_body(descriptors: &[[u8; DESCRIPTOR_LEN]], sketches: &mut [[f32; SKETCH_LEN]]) {
+    for (sketch, descriptor) in sketches.iter_mut().zip(descriptors) {
+        *sketch = sketch_of(descriptor);
+    }
+}
+
 /// Kept coefficients and the length of the others.
-fn sketch(descriptor: &[u8; DESCRIPTOR_LEN]) -> [f32; SKETCH_LEN] {
+#[inline(always)]
+fn sketch_of(descriptor: &[u8; DESCRIPTOR_LEN]) -> [f32; SKETCH_LEN] {
     let mut coefficients = transform(descriptor);
     for ([row, column, direction], typical) in TYPICAL {
         coefficients[row][column][direction] -= typical;
@@ -257,6 +271,7 @@ fn sketch(descriptor: &[u8; DESCRIPTOR_LEN]) -> [f32; SKETCH_LEN] {
     sketch
 }
 
+#[inline(always)]
 fn squared_length<const N: usize>(values: &[f32; N]) -> f32 {
     values.iter().map(|value| value * value).sum()
 }
@@ -283,6 +298,7 @@ const TURNS: [[f32; 8]; 8] = {
 };
 
 /// All coefficients: by frequency over rows, over columns, over directions.
+#[inline(always)]
 fn transform(descriptor: &[u8; DESCRIPTOR_LEN]) -> [[[f32; 8]; 4]; 4] {
     let cells = descriptor.as_chunks::<8>().0;
     let mut by_direction = [[[0.0_f32; 8]; 4]; 4];
@@ -319,8 +335,28 @@ fn transform(descriptor: &[u8; DESCRIPTOR_LEN]) -> [[[f32; 8]; 4]; 4] {
     all
 }
 
+#[inline(always)]
 fn add_scaled(sum: &mut [f32; 8], scale: f32, values: &[f32; 8]) {
     for (sum, value) in sum.iter_mut().zip(values) {
         *sum += scale * value;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn both_compilations_give_the_same_sketches() {
+        let descriptor = |k: usize| -> [u8; DESCRIPTOR_LEN] {
+            std::array::from_fn(|i| if k == 0 { 255 } else { ((k * 73 + i * i * 31 + k * i) % 256) as u8 })
+        };
+        let descriptors: Vec<_> = (0..300).map(descriptor).collect();
+        let sketches = |path: Path| {
+            let mut sketches = vec![[0.0; SKETCH_LEN]; descriptors.len()];
+            sketch_all(path, &descriptors, &mut sketches);
+            sketches.as_flattened().iter().map(|value| value.to_bits()).collect::<Vec<_>>()
+        };
+        assert_eq!(sketches(Path::BASELINE), sketches(Path::detect()));
     }
 }
