@@ -119,43 +119,53 @@ pub(crate) fn null_space<const R: usize, const C: usize, const K: usize>(
     rows: &SMatrix<f64, R, C>,
 ) -> Option<SMatrix<f64, C, K>> {
     const { assert!(R + K == C) };
-    let mut a = rows.transpose();
-    let scale = a.norm();
+    // Columns side by side, so that their sums advance together.
+    let mut a: [[f64; R]; C] = std::array::from_fn(|i| std::array::from_fn(|j| rows[(j, i)]));
+    let scale = rows.transpose().norm();
     let mut reflectors = [[0.0; C]; R];
     for j in 0..R {
-        let norm = (j..C).map(|i| a[(i, j)] * a[(i, j)]).sum::<f64>().sqrt();
+        let norm = (j..C).map(|i| a[i][j] * a[i][j]).sum::<f64>().sqrt();
         if !(norm > 1e-11 * scale) {
             return None;
         }
-        let alpha = if a[(j, j)] > 0.0 { -norm } else { norm };
+        let alpha = if a[j][j] > 0.0 { -norm } else { norm };
         let v = &mut reflectors[j];
         for i in j..C {
-            v[i] = a[(i, j)];
+            v[i] = a[i][j];
         }
         v[j] -= alpha;
         let length = v[j..].iter().map(|value| value * value).sum::<f64>().sqrt();
         for value in &mut v[j..] {
             *value /= length;
         }
-        for column in j + 1..R {
-            let twice = 2.0 * (j..C).map(|i| v[i] * a[(i, column)]).sum::<f64>();
-            for i in j..C {
-                a[(i, column)] -= twice * v[i];
-            }
-        }
+        // What becomes of columns up to the `j`-th is of no use any more.
+        reflect(v, &mut a, j);
     }
-    let mut basis = SMatrix::<f64, C, K>::zeros();
+    let mut basis = [[0.0; K]; C];
     for k in 0..K {
-        basis[(R + k, k)] = 1.0;
-        for j in (0..R).rev() {
-            let v = &reflectors[j];
-            let twice = 2.0 * (j..C).map(|i| v[i] * basis[(i, k)]).sum::<f64>();
-            for i in j..C {
-                basis[(i, k)] -= twice * v[i];
-            }
+        basis[R + k][k] = 1.0;
+    }
+    for j in (0..R).rev() {
+        reflect(&reflectors[j], &mut basis, j);
+    }
+    Some(SMatrix::from_fn(|i, k| basis[i][k]))
+}
+
+/// Reflects columns, of which the rows from `start` on are not fixed, at the plane with this normal.
+#[inline(always)]
+fn reflect<const C: usize, const N: usize>(normal: &[f64; C], columns: &mut [[f64; N]; C], start: usize) {
+    let mut twice = [0.0; N];
+    for i in start..C {
+        for k in 0..N {
+            twice[k] += normal[i] * columns[i][k];
         }
     }
-    Some(basis)
+    twice.iter_mut().for_each(|dot| *dot *= 2.0);
+    for i in start..C {
+        for k in 0..N {
+            columns[i][k] -= twice[k] * normal[i];
+        }
+    }
 }
 
 /// `a = u diag(s) vᵀ` of a 3×3 matrix with `s` falling, `u` and `v` rotations, and `s[2]` of the sign of `det a`.

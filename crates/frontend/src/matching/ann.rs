@@ -42,7 +42,7 @@ impl Prepared {
 
 /// Nearest neighbours as far as they were found, in the orders of both images.
 pub(super) fn nearest(first: &Prepared, second: &Prepared) -> Nearest {
-    let (rows, columns) = near(first.image(), second.image(), NUM_PROBES);
+    let (rows, columns) = near::<NUM_PROBES>(first.image(), second.image());
     Nearest {
         rows: rows.iter().map(Two::neighbour).collect(),
         columns: columns.iter().map(Two::neighbour).collect(),

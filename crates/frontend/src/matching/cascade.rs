@@ -96,7 +96,7 @@ pub(super) fn nearest(
     if first.descriptors.len() * second.descriptors.len() < LEAST_PRODUCTS {
         return None;
     }
-    let (near_rows, near_columns) = near(first.image(), second.image(), NUM_PROBES);
+    let (near_rows, near_columns) = near::<NUM_PROBES>(first.image(), second.image());
     let row_bases = first.sketches.row_bases(&second.sketches);
     let column_bases = second.sketches.column_bases(&first.sketches);
     let mut rows = Side::new(first, second, row_bases, &near_rows, options);

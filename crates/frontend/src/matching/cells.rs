@@ -14,9 +14,6 @@ const CELL_SIZE: usize = 64;
 
 /// Members of a cell that are guessed at, for each that looks into it.
 const GUESSES: usize = 2;
-/// Most cells that one looks into.
-pub(super) const MOST_PROBES: usize = 6;
-
 /// Cells of an image. Leaders are descriptors at equal steps; each descriptor goes to the leader that seems nearest.
 ///
 /// Descriptors are sorted by cell, so that what is looked at together lies together.
@@ -48,7 +45,7 @@ impl Cells {
         let leaders_guessed = Guessed::new(&gathered(&sketches.fine.codes, &leaders), path);
         let bases = gathered(&sketches.score_bases(&sketches), &leaders);
         let nearest = closest::<1>(&sketches.coarse.codes, &leaders_guessed, &bases);
-        let arrivals = Arrivals::new(&nearest, 1, num_leaders);
+        let arrivals = Arrivals::new(&nearest, num_leaders);
         // Nobody's member comes last.
         let strays = (0..len as u32).filter(|&at| nearest[at as usize] == [NOBODY]);
         let order: Vec<u32> = arrivals.all.iter().copied().chain(strays).collect();
@@ -69,21 +66,21 @@ impl Cells {
 }
 
 /// For each descriptor of two images the two nearest among some of the other's: of those that seem nearest in each of
-/// the `num_probes` cells, at most [`MOST_PROBES`], that it would go to, and of those that found it.
-pub(super) fn near(first: Image<'_>, second: Image<'_>, num_probes: usize) -> (Vec<Two>, Vec<Two>) {
+/// the `P` cells that it would go to, and of those that found it.
+pub(super) fn near<const P: usize>(first: Image<'_>, second: Image<'_>) -> (Vec<Two>, Vec<Two>) {
     let mut rows = vec![Two::default(); first.descriptors.len()];
     let mut columns = vec![Two::default(); second.descriptors.len()];
-    probe(first, second, num_probes, &mut rows, &mut columns);
-    probe(second, first, num_probes, &mut columns, &mut rows);
+    probe::<P>(first, second, &mut rows, &mut columns);
+    probe::<P>(second, first, &mut columns, &mut rows);
     (rows, columns)
 }
 
-fn probe(from: Image<'_>, into: Image<'_>, num_probes: usize, from_best: &mut [Two], into_best: &mut [Two]) {
+fn probe<const P: usize>(from: Image<'_>, into: Image<'_>, from_best: &mut [Two], into_best: &mut [Two]) {
     let bases = into.sketches.score_bases(from.sketches);
     let codes = &from.sketches.coarse.codes;
     let leader_bases = gathered(&bases, &into.cells.leaders);
-    let leaders = closest::<MOST_PROBES>(codes, &into.cells.leaders_guessed, &leader_bases);
-    let arrivals = Arrivals::new(&leaders, num_probes, into.cells.cells.len());
+    let leaders = closest::<P>(codes, &into.cells.leaders_guessed, &leader_bases);
+    let arrivals = Arrivals::new(&leaders, into.cells.cells.len());
     let (mut rows, mut pairs, mut squared) = (Vec::new(), Vec::new(), Vec::new());
     for (cell, arrivals) in into.cells.cells.iter().zip(arrivals.by_cell()) {
         gather(codes, arrivals, &mut rows);
@@ -109,9 +106,9 @@ struct Arrivals {
 }
 
 impl Arrivals {
-    /// `leaders` are the cells that each would go to, the first `num_probes` of which it does.
-    fn new<const N: usize>(leaders: &[[u32; N]], num_probes: usize, num_cells: usize) -> Self {
-        let visits = |at: usize| leaders[at][..num_probes].iter().take_while(|&&leader| leader != NOBODY);
+    /// `leaders` are the cells that each goes to.
+    fn new<const N: usize>(leaders: &[[u32; N]], num_cells: usize) -> Self {
+        let visits = |at: usize| leaders[at].iter().take_while(|&&leader| leader != NOBODY);
         let mut starts = vec![0; num_cells + 1];
         (0..leaders.len()).flat_map(visits).for_each(|&leader| starts[leader as usize + 1] += 1);
         let mut sum = 0;
