@@ -12,6 +12,7 @@ mod peer;
 mod repeatability;
 mod retrieval;
 mod sets;
+mod surveyed;
 mod two_views;
 mod whole;
 
