@@ -18,6 +18,8 @@ pub struct Request {
     pub quick: bool,
     /// Only figures whose name contains this.
     pub only: Option<String>,
+    /// Only sets of photographs whose name contains this, in sections that go through them.
+    pub set: Option<String>,
 }
 
 impl Request {
@@ -35,7 +37,10 @@ impl Request {
                 "--quick" => request.quick = true,
                 "--json" => request.json = Some(value()?.into()),
                 "--only" => request.only = Some(value()?),
-                other => anyhow::bail!("unknown flag {other}; known: --json FILE, --quick, --only TEXT"),
+                "--set" => request.set = Some(value()?),
+                other => anyhow::bail!(
+                    "unknown flag {other}; known: --json FILE, --quick, --only TEXT, --set TEXT"
+                ),
             }
         }
         Ok(request)
@@ -44,6 +49,11 @@ impl Request {
     /// Whether a figure of this name is wanted.
     pub fn wants(&self, name: &str) -> bool {
         self.only.as_ref().is_none_or(|only| name.contains(only.as_str()))
+    }
+
+    /// Whether a set of this name is wanted; `is_quick` says whether it belongs to a quick run.
+    pub fn wants_set(&self, name: &str, is_quick: bool) -> bool {
+        (is_quick || !self.quick) && self.set.as_ref().is_none_or(|set| name.contains(set.as_str()))
     }
 }
 

@@ -18,7 +18,8 @@ const ROUNDS: usize = 3;
 
 pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
     let mut rows = Vec::new();
-    for set in NAMES.iter().map(|name| Set::named(name)).filter(|set| set.quick || !request.quick) {
+    for set in NAMES.iter().map(|name| Set::named(name)).filter(|set| request.wants_set(set.name, set.quick))
+    {
         let photographs = set.photographs(LIMIT)?;
         for (octave, first_octave) in [("-1", FirstOctave::Doubled), ("0", FirstOctave::Original)] {
             rows.extend(compare(set, &photographs, octave, first_octave)?);

@@ -19,7 +19,7 @@ pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
         let row = Row::new("repeatability", None, "", Bar::None);
         return Ok(vec![row.note("no Python with pycolmap")]);
     };
-    let sets = SETS.iter().filter(|set| set.quick || !request.quick);
+    let sets = SETS.iter().filter(|set| request.wants_set(set.name, set.quick));
     let photographs: Vec<PathBuf> =
         sets.map(chosen).collect::<anyhow::Result<Vec<_>>>()?.into_iter().flatten().collect();
     let folder = tempfile::tempdir()?;

@@ -26,7 +26,7 @@ pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
     let mut rows = Vec::new();
     let mut ratios = Vec::new();
     let mut milliseconds = Vec::new();
-    for set in SETS.iter().filter(|set| set.quick || !request.quick) {
+    for set in SETS.iter().filter(|set| request.wants_set(set.name, set.quick)) {
         let answer = peer::frontend(set, &[]);
         let Some(theirs) = answer.as_ref().and_then(|answer| inliers_by_pair(&answer.value)) else {
             rows.push(

@@ -15,7 +15,7 @@ const STAGES: [&str; 4] = ["ingest", "features", "pairs", "match"];
 pub fn rows(request: &Request) -> anyhow::Result<Vec<Row>> {
     let terrane = process::terrane()?;
     let mut rows = Vec::new();
-    for set in SETS.iter().filter(|set| set.quick || !request.quick) {
+    for set in SETS.iter().filter(|set| request.wants_set(set.name, set.quick)) {
         let out = tempfile::tempdir()?;
         let mut run = Command::new(&terrane);
         run.arg("run").arg(set.path()).arg("-o").arg(out.path());
