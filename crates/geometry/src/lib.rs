@@ -15,8 +15,11 @@ pub mod homography;
 mod linear;
 #[cfg(test)]
 mod manifold_tests;
+pub mod p2p;
 pub mod p3p;
+pub mod p4pf;
 mod polynomial;
+mod quadrics;
 pub mod ransac;
 mod rigid3;
 mod seed;
