@@ -5,9 +5,7 @@
 //! first two of one length, makes four quadrics in three unknowns: three are intersected, and four pixels, which have an
 //! equation to spare, judge. Of points on one plane the homography gives the focal length in closed form.
 
-use nalgebra::{
-    Matrix3, Matrix4, Rotation3, SVector, UnitQuaternion, Vector2, Vector3, Vector4,
-};
+use nalgebra::{Matrix3, Matrix4, Rotation3, SVector, UnitQuaternion, Vector2, Vector3, Vector4};
 use smallvec::SmallVec;
 
 use crate::Rigid3;
@@ -58,9 +56,9 @@ struct State {
 
 impl State {
     fn is_near(&self, other: &Self) -> bool {
-        let turn = (self.pose.rotation.coords - other.pose.rotation.coords).norm_squared().min(
-            (self.pose.rotation.coords + other.pose.rotation.coords).norm_squared(),
-        );
+        let turn = (self.pose.rotation.coords - other.pose.rotation.coords)
+            .norm_squared()
+            .min((self.pose.rotation.coords + other.pose.rotation.coords).norm_squared());
         turn < 1e-12 && (self.focal - other.focal).abs() < 1e-6 * self.focal
     }
 }
@@ -132,7 +130,8 @@ impl Scaled {
                     r2.transpose() / across,
                     r3.transpose() / r3.norm(),
                 ]);
-                let translation = Vector3::new(offsets[0] / across, offsets[1] / across, offsets[2] / r3.norm());
+                let translation =
+                    Vector3::new(offsets[0] / across, offsets[1] / across, offsets[2] / r3.norm());
                 starts.extend(state_near(&matrix, translation, focal));
             }
         }
@@ -155,7 +154,9 @@ impl Scaled {
         ];
         let squared = equations.iter().map(|e| e.x * e.x).sum::<f64>();
         let w = -equations.iter().map(|e| e.x * e.y).sum::<f64>() / squared;
-        if !(w > 1e-12 && w.is_finite()) {
+        // Parallel to the image both equations vanish, and what is left of them is rounding.
+        let size = (a.norm_squared() + b.norm_squared()).powi(2);
+        if !(w > 1e-12 && w.is_finite() && squared > 1e-20 * size) {
             return starts;
         }
         let focal = 1.0 / w.sqrt();
@@ -196,11 +197,8 @@ fn state_near(matrix: &Matrix3<f64>, translation: Vector3<f64>, focal: f64) -> O
     if !(y.dot(&matrix.row(1).transpose()) > 0.0) {
         return None;
     }
-    let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_rows(&[
-        x.transpose(),
-        y.transpose(),
-        z.transpose(),
-    ]));
+    let rotation =
+        Rotation3::from_matrix_unchecked(Matrix3::from_rows(&[x.transpose(), y.transpose(), z.transpose()]));
     Some(State { pose: Rigid3::new(UnitQuaternion::from_rotation_matrix(&rotation), translation), focal })
 }
 

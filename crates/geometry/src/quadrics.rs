@@ -190,7 +190,9 @@ mod tests {
     fn degenerate_input_gives_only_finite_points() {
         let mut random = Random::new("quadrics degenerate");
         let q = random_quadric_through(&mut random, &Vector4::x());
-        for bad in [[q; 3], [Matrix4::zeros(); 3], [Matrix4::repeat(f64::NAN); 3], [q, q * 2.0, Matrix4::identity()]] {
+        for bad in
+            [[q; 3], [Matrix4::zeros(); 3], [Matrix4::repeat(f64::NAN); 3], [q, q * 2.0, Matrix4::identity()]]
+        {
             for point in intersect_three_quadrics(&bad) {
                 assert!(point.iter().all(|value| value.is_finite()));
             }

@@ -60,7 +60,7 @@ fn truth_is_among_the_solutions() {
         }
     }
     assert!(good >= 4950, "{good} {count}");
-    assert!(count >= 4950 && count < 10_000, "{count}");
+    assert!((4950..10_000).contains(&count), "{count}");
 }
 
 #[test]
@@ -94,8 +94,7 @@ fn the_jacobian_is_right() {
     let scaled = Scaled::new(&case.offset_px, &case.x_in_world).unwrap();
     let pose = case.truth.cam_from_world;
     let shifted = (pose.translation + pose.rotation * scaled.mean) / scaled.spread;
-    let state =
-        State { pose: Rigid3::new(pose.rotation, shifted), focal: case.truth.focal_px / scaled.px };
+    let state = State { pose: Rigid3::new(pose.rotation, shifted), focal: case.truth.focal_px / scaled.px };
     assert_gradient(&scaled, &state, 1e-5);
 }
 
@@ -111,7 +110,5 @@ fn degenerate_input_gives_no_nonsense() {
     assert!(p4pf(&pixels, &[x[0], x[1], x[2], Vector3::repeat(f64::INFINITY)]).is_empty());
     // A plane parallel to the image: any focal length fits.
     let parallel = pixels.map(|p| (p / 1000.0).push(1.0) * 5.0);
-    for found in p4pf(&pixels, &parallel) {
-        assert!(found.focal_px.is_finite() && found.cam_from_world.translation.norm().is_finite());
-    }
+    assert!(p4pf(&pixels, &parallel).is_empty());
 }
