@@ -18,6 +18,7 @@ mod manifold_tests;
 pub mod p2p;
 pub mod p3p;
 pub mod p4pf;
+pub mod pnp;
 mod polynomial;
 mod quadrics;
 pub mod ransac;
