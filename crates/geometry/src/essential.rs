@@ -1,4 +1,4 @@
-//! Essential matrices from five correspondences (Nistér 2004).
+//! Essential matrices from five correspondences (Nistér 2004), and linearly from eight or more.
 //!
 //! The matrices that satisfy five epipolar constraints form a space of four; in it the ten cubic constraints of an essential
 //! matrix are eliminated to a polynomial of degree ten in one unknown, whose real roots are isolated by Sturm's theorem.
@@ -6,7 +6,8 @@
 use nalgebra::{Matrix3, Matrix4, SMatrix, Vector2, Vector3, Vector4};
 use smallvec::SmallVec;
 
-use crate::linear::{null_space, solve_positive_definite};
+use crate::fundamental::fundamental_from_eight;
+use crate::linear::{null_space, proper_svd3, solve_positive_definite};
 use crate::polynomial::degree_ten_roots;
 
 /// Exponents of (x, y, z) of the monomials of degree at most two and three. The cubic ones are in Nistér's order: the first
@@ -102,6 +103,17 @@ pub fn essential_from_five(
         }
     }
     found
+}
+
+/// The essential matrix (Frobenius norm one) nearest to the matrix that fits eight or more correspondences on the plane z = 1
+/// linearly (Longuet-Higgins 1981; normalised as Hartley 1997).
+///
+/// `None` for what [`fundamental_from_eight`] refuses: fewer than eight, points on one plane or otherwise dependent, lengths
+/// that differ, non-finite values.
+pub fn essential_from_eight(first: &[Vector2<f64>], second: &[Vector2<f64>]) -> Option<Matrix3<f64>> {
+    let (u, _, v) = proper_svd3(&fundamental_from_eight(first, second)?)?;
+    let equal = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, 0.0));
+    Some((u * equal * v.transpose()).normalize())
 }
 
 /// The coefficients of `second ᵀ M first` in the entries of M, row by row.
@@ -285,8 +297,9 @@ fn constraint_change(e: &Matrix3<f64>, d: &Matrix3<f64>) -> Matrix3<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::epipolar::essential_from_pose;
     use crate::so3::skew;
-    use crate::test_support::{Random, two_views};
+    use crate::test_support::{Random, TwoViews, two_views};
 
     fn five(points: &[Vector2<f64>]) -> [Vector2<f64>; 5] {
         [points[0], points[1], points[2], points[3], points[4]]
@@ -337,5 +350,34 @@ mod tests {
         for e in essential_from_five(&line, &line).iter().chain(&essential_from_five(&first, &first)) {
             assert!(e.iter().all(|value| value.is_finite()));
         }
+    }
+
+    #[test]
+    fn eight_points_and_more_give_the_truth_and_feel_noise() {
+        let mut random = Random::new("essential from eight");
+        let off = |views: &TwoViews| {
+            let truth = essential_from_pose(&views.second_from_first).normalize();
+            let found = essential_from_eight(&views.first, &views.second).unwrap();
+            let twice: Matrix3<f64> = 2.0 * found * found.transpose() * found - found;
+            assert!(twice.norm() < 1e-12, "two equal singular values and a zero: {twice}");
+            (found - truth).norm().min((found + truth).norm())
+        };
+        let mut good = 0;
+        for case in 0..1000 {
+            good += usize::from(off(&two_views(&mut random, 8 + case % 20, 0.0, false)) < 1e-5);
+        }
+        assert!(good >= 990, "{good}");
+        let mut median = |noise: f64| {
+            let mut errors: Vec<f64> =
+                (0..301).map(|_| off(&two_views(&mut random, 100, noise, false))).collect();
+            errors.sort_by(f64::total_cmp);
+            errors[150]
+        };
+        let (small, large) = (median(1e-5), median(1e-4));
+        assert!(small > 1e-6 && large > 5.0 * small && large < 20.0 * small, "{small} {large}");
+        let plane = two_views(&mut random, 20, 0.0, true);
+        assert!(essential_from_eight(&plane.first, &plane.second).is_none());
+        assert!(essential_from_eight(&plane.first[..7], &plane.second[..7]).is_none());
+        assert!(essential_from_eight(&[Vector2::repeat(f64::NAN); 9], &plane.second[..9]).is_none());
     }
 }
