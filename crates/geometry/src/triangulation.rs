@@ -14,6 +14,10 @@ use crate::ransac::{self, Score};
 use crate::small_lm::{self, LeastSquares, LmOptions, NormalEquations};
 use crate::{Camera, Rigid3, Seed};
 
+mod two_rays;
+
+pub use two_rays::{corrected_pair, triangulate_pair};
+
 #[cfg(test)]
 mod tests;
 
@@ -56,6 +60,35 @@ pub struct Triangulated {
     pub inliers: Vec<u32>,
     /// The largest angle between two supporting rays, in radians.
     pub angle_rad: f64,
+}
+
+impl Triangulated {
+    /// Indices of the views, of this many, that don't support the point; ascending.
+    pub fn outliers(&self, num_views: usize) -> Vec<u32> {
+        (0..num_views as u32).filter(|i| self.inliers.binary_search(i).is_err()).collect()
+    }
+}
+
+/// The covariance of a point fitted to these views by least squares, in the world's squared unit, when each coordinate of a
+/// pixel has this standard deviation: `σ² (JᵀJ)⁻¹`, first order (Hartley & Zisserman 2004, section 5.2).
+///
+/// `None` when the views don't determine the point (fewer than two, or rays that are parallel to working precision), the point
+/// is not ahead of all cameras, or a value is not finite.
+pub fn point_covariance(views: &[View], x_in_world: &Vector3<f64>, sigma_px: f64) -> Option<Matrix3<f64>> {
+    let problem = PointProblem { views };
+    if views.len() < 2 || !problem.cost(x_in_world).is_finite() {
+        return None;
+    }
+    let mut equations = NormalEquations::default();
+    problem.linearize(x_in_world, &mut equations);
+    let hessian = equations.hessian();
+    let mut covariance = Matrix3::zeros();
+    for axis in 0..3 {
+        let mut unit = Vector3::zeros();
+        unit[axis] = sigma_px * sigma_px;
+        covariance.set_column(axis, &solve_positive_definite(&hessian, &unit)?);
+    }
+    Some(0.5 * (covariance + covariance.transpose()))
 }
 
 /// The angle at `x` between the directions to two camera centres, in radians within [0, π].

@@ -118,3 +118,35 @@ fn angles_are_exact_at_their_ends() {
     assert!((angle(Vector3::x(), -Vector3::x()) - std::f64::consts::PI).abs() < 1e-15);
     assert!((angle(Vector3::x(), Vector3::y()) - std::f64::consts::FRAC_PI_2).abs() < 1e-15);
 }
+
+#[test]
+fn the_covariance_predicts_the_scatter() {
+    let mut random = Random::new("point covariance");
+    let sigma_px = 0.5;
+    let (x, clean) = views(&mut random, 5, 0.0);
+    let predicted = point_covariance(&clean, &x, sigma_px).unwrap();
+    let (mut scatter, count) = (Matrix3::zeros(), 4000);
+    for _ in 0..count {
+        let mut noisy = clean.clone();
+        noisy.iter_mut().for_each(|view| view.xy_px += random.gaussian2(sigma_px));
+        let off = triangulate(&noisy).unwrap() - x;
+        scatter += off * off.transpose() / f64::from(count);
+    }
+    for direction in [Vector3::x(), Vector3::y(), Vector3::z(), Vector3::repeat(0.6)] {
+        let ratio = direction.dot(&(scatter * direction)) / direction.dot(&(predicted * direction));
+        assert!(ratio > 0.9 && ratio < 1.1, "{ratio}");
+    }
+    let doubled = point_covariance(&clean, &x, 2.0 * sigma_px).unwrap();
+    assert!((doubled - 4.0 * predicted).norm() < 1e-12 * doubled.norm());
+    assert!(point_covariance(&clean[..1], &x, 1.0).is_none());
+    assert!(point_covariance(&[clean[0], clean[0]], &x, 1.0).is_none());
+    assert!(point_covariance(&clean, &Vector3::repeat(f64::NAN), 1.0).is_none());
+    assert!(point_covariance(&clean, &Vector3::repeat(100.0), 1.0).is_none());
+}
+
+#[test]
+fn outliers_are_the_rest() {
+    let found = Triangulated { x_in_world: Vector3::zeros(), inliers: vec![1, 4], angle_rad: 1.0 };
+    assert_eq!(found.outliers(6), [0, 2, 3, 5]);
+    assert!(found.outliers(0).is_empty());
+}
