@@ -22,6 +22,7 @@ pub mod pnp;
 mod polynomial;
 mod quadrics;
 pub mod ransac;
+pub mod resection;
 mod rigid3;
 mod seed;
 mod sim3;
