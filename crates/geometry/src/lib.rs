@@ -5,6 +5,7 @@
 
 pub mod absolute_pose;
 pub mod alignment;
+pub mod calibration;
 pub mod camera;
 mod elementary;
 mod epipolar;
