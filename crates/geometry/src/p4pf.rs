@@ -117,7 +117,7 @@ impl Scaled {
         };
         let quadrics = [product(0, 1), product(0, 0) - product(1, 1), product(0, 2), product(1, 2)];
         let mut starts = SmallVec::new();
-        for depths in intersect_three_quadrics(&[quadrics[0], quadrics[1], quadrics[2] + quadrics[3]]) {
+        for depths in candidates(&quadrics) {
             let d = if depths.sum() < 0.0 { -depths } else { depths };
             let [r1, r2, r3] = [0, 1, 2].map(|k| linear[k] * d);
             // With a scale s: row 1 and 2 are s f r, row 3 is s r.
@@ -186,6 +186,24 @@ impl Scaled {
         let finite = state.pose.translation.iter().all(|value| value.is_finite());
         (misfit < MAX_MISFIT && finite && state.focal > 0.0).then_some((misfit, state))
     }
+}
+
+/// Where three of the four quadrics meet; of two choices of three, that at which some point misses the fourth by less.
+fn candidates(quadrics: &[Matrix4<f64>; 4]) -> SmallVec<[Vector4<f64>; 8]> {
+    // A point that is found badly, or two that nearly coincide, in one choice are apart in the other.
+    const NEAR: f64 = 1e-6;
+    let misfit = |points: &[Vector4<f64>]| {
+        let worst =
+            |p: &Vector4<f64>| quadrics.iter().map(|q| p.dot(&(q * p)).abs() / q.norm()).fold(0.0, f64::max);
+        points.iter().map(worst).fold(f64::INFINITY, f64::min)
+    };
+    let first = intersect_three_quadrics(&[quadrics[0], quadrics[1], quadrics[2] + quadrics[3]]);
+    let first_misfit = misfit(&first);
+    if first_misfit < NEAR {
+        return first;
+    }
+    let second = intersect_three_quadrics(&[quadrics[0] + quadrics[1], quadrics[2], quadrics[3]]);
+    if misfit(&second) < first_misfit { second } else { first }
 }
 
 /// The state of which the rotation is nearest to a matrix by Gram–Schmidt; `None` for a mirrored or flat one.
