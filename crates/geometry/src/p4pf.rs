@@ -190,8 +190,9 @@ impl Scaled {
 
 /// Where three of the four quadrics meet; of two choices of three, that at which some point misses the fourth by less.
 fn candidates(quadrics: &[Matrix4<f64>; 4]) -> SmallVec<[Vector4<f64>; 8]> {
-    // A point that is found badly, or two that nearly coincide, in one choice are apart in the other.
-    const NEAR: f64 = 1e-6;
+    // What one choice loses near a double root the other may keep. A looser bound is met by wrong points when the four points
+    // of the world nearly lie on a plane.
+    const NEAR: f64 = 1e-10;
     let misfit = |points: &[Vector4<f64>]| {
         let worst =
             |p: &Vector4<f64>| quadrics.iter().map(|q| p.dot(&(q * p)).abs() / q.norm()).fold(0.0, f64::max);
