@@ -129,7 +129,7 @@ impl Form {
     /// Rotations near the eigenvectors that may hold the minimum, of both signs.
     fn starts(&self) -> SmallVec<[UnitQuaternion<f64>; 16]> {
         let mut starts = SmallVec::new();
-        // One more than vanish: noise lifts them.
+        // Two more than vanish: noise lifts them.
         for k in 0..(self.nullity + 2).min(9) {
             let vector: [f64; 9] = std::array::from_fn(|i| self.vectors[(i, k)]);
             let matrix = Matrix3::from_row_slice(&vector);
