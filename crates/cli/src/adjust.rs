@@ -45,6 +45,7 @@ pub fn adjust(flags: &AdjustFlags, json: bool) -> Result<(), Failure> {
         loss_scale_px: flags.loss_scale_px,
         max_iterations: flags.max_iterations,
         cost_tolerance: flags.cost_tolerance,
+        initial_damping: flags.initial_damping,
         solver: flags.solver,
         preconditioner: flags.preconditioner,
         precision: flags.precision,
@@ -91,8 +92,7 @@ fn read(flags: &AdjustFlags) -> Result<(Source, WholeProblem), Failure> {
             problems::from_model(&model.reconstruction, refine(&flags.refine)?).map_err(|e| invalid(&e))?;
         return Ok((Source::Model(Box::new(model)), whole));
     }
-    let bal = bal::read(open(&flags.problem)?).map_err(|error| invalid(&error))?;
-    let whole = problems::from_bal(bal).map_err(|error| invalid(&error))?;
+    let whole = problems::read_bal(open(&flags.problem)?).map_err(|error| invalid(&error))?;
     Ok((Source::Bal(flags.problem.clone()), whole))
 }
 

@@ -282,6 +282,9 @@ pub struct AdjustFlags {
     /// Stop when a step lowers the cost by less than this part.
     #[arg(long, value_name = "PART", default_value_t = 1e-6)]
     pub cost_tolerance: f64,
+    /// First damping, relative to the diagonal of the normal equations.
+    #[arg(long, value_name = "PART", default_value_t = 1e-4)]
+    pub initial_damping: f64,
     /// How steps are solved for: auto, explicit (a factorised camera system), implicit (conjugate gradients).
     #[arg(long, value_name = "NAME", default_value = "auto", value_parser = serde_name::<BundleSolver>)]
     pub solver: BundleSolver,

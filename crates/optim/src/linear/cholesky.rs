@@ -73,7 +73,8 @@ pub(super) struct SparseCholesky {
 }
 
 impl SparseCholesky {
-    pub fn new(pattern: &BlockPattern) -> Result<Self, LinearError> {
+    /// With or without dense kernels for columns of equal pattern; these take memory by the size of the processor's caches.
+    pub fn new(pattern: &BlockPattern, supernodal: bool) -> Result<Self, LinearError> {
         let n = pattern.num_unknowns();
         let failed =
             |e: faer::sparse::FaerError| LinearError(format!("{n} unknowns can't be ordered: {e:?}"));
@@ -81,7 +82,11 @@ impl SparseCholesky {
         let (starts, indices) = pattern.scalar_columns();
         let columns = SymbolicSparseColMat::new_checked(n, n, starts, None, indices);
         let params = CholeskySymbolicParams {
-            supernodal_flop_ratio_threshold: SupernodalThreshold::FORCE_SUPERNODAL,
+            supernodal_flop_ratio_threshold: if supernodal {
+                SupernodalThreshold::FORCE_SUPERNODAL
+            } else {
+                SupernodalThreshold::FORCE_SIMPLICIAL
+            },
             ..Default::default()
         };
         let order = PermRef::new_checked(&forward, &inverse, n);

@@ -23,6 +23,8 @@ pub enum LinearSolver {
     Dense,
     /// Sparse supernodal Cholesky in approximate-minimum-degree order (Amestoy, Davis & Duff 1996).
     Sparse,
+    /// Sparse Cholesky column by column, in the same order: slower, but in hardly more memory than the factor.
+    Simplicial,
 }
 
 /// A system that is too large for this machine.
@@ -54,8 +56,9 @@ impl BlockSystem {
         let factor = match solver {
             LinearSolver::Dense => Factor::Dense(DenseCholesky::new(n)),
             LinearSolver::Auto if n <= SMALL_DENSE => Factor::Dense(DenseCholesky::new(n)),
+            LinearSolver::Simplicial => Factor::Sparse(Box::new(SparseCholesky::new(&pattern, false)?)),
             LinearSolver::Auto | LinearSolver::Sparse => {
-                let sparse = SparseCholesky::new(&pattern)?;
+                let sparse = SparseCholesky::new(&pattern, true)?;
                 let full = 0.5 * n as f64 * n as f64;
                 if solver == LinearSolver::Auto && sparse.num_values() as f64 > DENSE_FILL * full {
                     Factor::Dense(DenseCholesky::new(n))

@@ -38,7 +38,7 @@ fn ring(dims: &[usize], solver: LinearSolver) -> (BlockSystem, DMatrix<f64>, DVe
 #[test]
 fn dense_and_sparse_agree_with_a_plain_solve() {
     let dims: Vec<usize> = (0..30).map(|i| 1 + i % 7).collect();
-    for solver in [LinearSolver::Dense, LinearSolver::Sparse, LinearSolver::Auto] {
+    for solver in [LinearSolver::Dense, LinearSolver::Sparse, LinearSolver::Simplicial, LinearSolver::Auto] {
         let (mut system, dense, right) = ring(&dims, solver);
         let expected = dense.clone().cholesky().unwrap().solve(&right);
         for _ in 0..2 {
@@ -47,13 +47,14 @@ fn dense_and_sparse_agree_with_a_plain_solve() {
             system.solve_in_place(got.as_mut_slice());
             assert!((&got - &expected).amax() < 1e-12, "{solver:?}");
         }
-        assert_eq!(system.is_dense(), solver != LinearSolver::Sparse);
+        let sparse = matches!(solver, LinearSolver::Sparse | LinearSolver::Simplicial);
+        assert_eq!(system.is_dense(), !sparse);
     }
 }
 
 #[test]
 fn indefinite_and_non_finite_matrices_are_refused() {
-    for solver in [LinearSolver::Dense, LinearSolver::Sparse] {
+    for solver in [LinearSolver::Dense, LinearSolver::Sparse, LinearSolver::Simplicial] {
         let mut system = BlockSystem::new(BlockPattern::full(&[2, 2]), solver).unwrap();
         assert!(!system.factorize(), "zero matrix");
         for block in 0..2 {

@@ -1,11 +1,8 @@
 //! The block of one cluster of cameras: built from its part's points, factorised, solved with.
 
-use faer::dyn_stack::{MemBuffer, MemStack};
-use faer::linalg::cholesky::llt;
-use faer::{MatMut, Par};
-
 use super::super::layout::NONE;
 use super::blocks::widest;
+use super::cholesky::Lower;
 use super::part::CameraMap;
 use super::real::{LANES, Real, by_stride, fused};
 use super::state::{Frame, PartState, packed};
@@ -108,15 +105,15 @@ impl<T: Real> PartState<T> {
     pub fn factorize_local(&mut self, frame: &Frame<'_>, cluster: usize, diagonal: &[f64]) {
         let owned = owned_cameras(frame.map, &frame.clusters.members[cluster], &self.part.poses);
         let n = owned.last().map_or(0, |last| last.offset as usize + last.num_rows());
-        let mut matrix = vec![0.0; n * n];
-        add_diagonal(&mut matrix, n, &owned, frame.map.width(), diagonal);
-        self.subtract_pairs(&mut matrix, n, &owned, frame.map.stride);
-        let mut held = factorize(&mut matrix, n);
+        let mut matrix = Lower::zeros(n);
+        add_diagonal(&mut matrix, &owned, frame.map.width(), diagonal);
+        self.subtract_pairs(&mut matrix, &owned, frame.map.stride);
+        let mut held = matrix.factorize();
         if !held {
             // Rounding has the last word only where the cluster hardly holds together: its cameras one by one then.
-            matrix.fill(0.0);
-            add_diagonal(&mut matrix, n, &owned, frame.map.width(), diagonal);
-            held = factorize(&mut matrix, n);
+            matrix = Lower::zeros(n);
+            add_diagonal(&mut matrix, &owned, frame.map.width(), diagonal);
+            held = matrix.factorize();
         }
         let mut factor = self.local.take().unwrap_or_else(|| LocalFactor {
             owned: Vec::new(),
@@ -128,10 +125,10 @@ impl<T: Real> PartState<T> {
         factor.columns.clear();
         factor.inverse.clear();
         for column in 0..n {
-            let values = &matrix[n * column..n * (column + 1)];
+            let values = matrix.column(column);
             if held {
-                factor.inverse.push(T::from_f64(1.0 / values[column]));
-                factor.columns.extend(values[column + 1..].iter().map(|v| T::from_f64(*v)));
+                factor.inverse.push(T::from_f64(1.0 / values[0]));
+                factor.columns.extend(values[1..].iter().map(|v| T::from_f64(*v)));
             } else {
                 factor.inverse.push(T::from_f64(1.0));
                 factor.columns.extend(std::iter::repeat_n(T::default(), n - column - 1));
@@ -141,16 +138,11 @@ impl<T: Real> PartState<T> {
     }
 
     /// Takes `Z_i Z_jᵀ` of each two of the cluster's cameras that see one of the part's points.
-    fn subtract_pairs(&self, matrix: &mut [f64], n: usize, owned: &[Owned], stride: usize) {
-        by_stride!(stride, K, WIDTH => self.subtract_pairs_of::<K, WIDTH>(matrix, n, owned));
+    fn subtract_pairs(&self, matrix: &mut Lower, owned: &[Owned], stride: usize) {
+        by_stride!(stride, K, WIDTH => self.subtract_pairs_of::<K, WIDTH>(matrix, owned));
     }
 
-    fn subtract_pairs_of<const K: usize, const W: usize>(
-        &self,
-        matrix: &mut [f64],
-        n: usize,
-        owned: &[Owned],
-    ) {
+    fn subtract_pairs_of<const K: usize, const W: usize>(&self, matrix: &mut Lower, owned: &[Owned]) {
         // Of each observation three columns of `Z`, one after another.
         let (mut seen, mut values) = (Vec::<(u32, u32)>::new(), Vec::<[f64; W]>::new());
         for (at, camera) in owned.iter().enumerate().filter(|(_, camera)| camera.camera != NONE) {
@@ -184,24 +176,16 @@ impl<T: Real> PartState<T> {
                     if a.offset == b.offset {
                         continue;
                     }
+                    let stride = matrix.stride;
+                    let target = &mut matrix.values[stride * place.1 + place.0..];
                     widest(
                         #[inline(always)]
                         || {
                             if b.num_rows() == W {
-                                subtract_block::<W>(
-                                    &mut matrix[n * place.1 + place.0..],
-                                    n,
-                                    (zb, W),
-                                    (za, a.num_rows()),
-                                );
+                                // The usual case, with a constant to unroll by.
+                                subtract_block::<W>(target, stride, (zb, W), (za, a.num_rows()));
                             } else {
-                                let rows = b.num_rows();
-                                subtract_block::<W>(
-                                    &mut matrix[n * place.1 + place.0..],
-                                    n,
-                                    (zb, rows),
-                                    (za, a.num_rows()),
-                                );
+                                subtract_block::<W>(target, stride, (zb, b.num_rows()), (za, a.num_rows()));
                             }
                         },
                     );
@@ -245,31 +229,17 @@ fn subtract_block<const W: usize>(
     }
 }
 
-fn add_diagonal(matrix: &mut [f64], n: usize, owned: &[Owned], width: usize, diagonal: &[f64]) {
+fn add_diagonal(matrix: &mut Lower, owned: &[Owned], width: usize, diagonal: &[f64]) {
     for camera in owned {
         let block =
             &diagonal[packed(width) * camera.pose as usize..packed(width) * (camera.pose as usize + 1)];
         for (i, a) in camera.rows().enumerate() {
             for (j, b) in camera.rows().enumerate().take(i + 1) {
-                matrix[n * (camera.offset as usize + j) + camera.offset as usize + i] = block[packed(a) + b];
+                let (row, column) = (camera.offset as usize + i, camera.offset as usize + j);
+                matrix.values[matrix.stride * column + row] = block[packed(a) + b];
             }
         }
     }
-}
-
-/// Cholesky in place, in the lower triangle; whether the matrix was positive definite.
-fn factorize(matrix: &mut [f64], n: usize) -> bool {
-    if n == 0 {
-        return true;
-    }
-    if !matrix.iter().all(|v| v.is_finite()) {
-        return false;
-    }
-    let mut memory =
-        MemBuffer::new(llt::factor::cholesky_in_place_scratch::<f64>(n, Par::Seq, Default::default()));
-    let stack = MemStack::new(&mut memory);
-    let matrix = MatMut::from_column_major_slice_mut(matrix, n, n);
-    llt::factor::cholesky_in_place(matrix, Default::default(), Par::Seq, stack, Default::default()).is_ok()
 }
 
 /// `x = L⁻ᵀ L⁻¹ x`.

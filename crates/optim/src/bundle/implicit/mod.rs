@@ -6,6 +6,7 @@
 //! last bit for any number of threads and holders.
 
 mod blocks;
+mod cholesky;
 mod clusters;
 mod coarse;
 mod conjugate_gradients;

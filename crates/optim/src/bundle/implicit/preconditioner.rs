@@ -98,7 +98,7 @@ impl Coarse {
             }
         }
         // A pose without observations still ties its cluster to its intrinsics: both lie on the diagonal.
-        let system = BlockSystem::new(BlockPattern::new(&dims, above), LinearSolver::Auto)?;
+        let system = BlockSystem::new(BlockPattern::new(&dims, above), LinearSolver::Simplicial)?;
         Ok(Self { system, touched, columns: Vec::new(), holds: false })
     }
 
