@@ -66,6 +66,12 @@ pub fn adjust(flags: &AdjustFlags, json: bool) -> Result<(), Failure> {
         adjustment::solve(&mut whole.problem, &mut whole.shards, &options).map_err(failed)?
     };
     let solve_seconds = started.elapsed().as_secs_f64();
+    if whole.shards.0.iter().all(|shard| shard.observations.is_empty()) {
+        // They were let go while parts held them.
+        for (shard, read) in whole.shards.0.iter_mut().zip(read(flags)?.1.shards.0) {
+            shard.observations = read.observations;
+        }
+    }
     let after = ResidualFigures::of(&whole);
     write(&source, &whole, &flags.out)?;
     let outcome = Outcome { whole: &whole, report: &report, before, after, read_seconds, solve_seconds };
@@ -185,6 +191,7 @@ fn solve_from_disk(
 ) -> Result<BundleReport, Failure> {
     let scratch = Scratch::new(flags)?;
     let stored = adjustment::store_parts(whole, options, &scratch.parts()).map_err(stored_badly)?;
+    whole.shards.0.iter_mut().for_each(|shard| shard.observations = Vec::new());
     let mut worker = PartWorker::new(stored.side.clone(), Some(Arc::new(scratch.parts())), memory_bytes);
     for index in 0..stored.weights.len() as u32 {
         worker.take_stored(index).map_err(failed)?;
@@ -201,6 +208,7 @@ fn solve_on_workers(
     log::to_stderr();
     let scratch = Scratch::new(flags)?;
     let stored = adjustment::store_parts(whole, options, &scratch.parts()).map_err(stored_badly)?;
+    whole.shards.0.iter_mut().for_each(|shard| shard.observations = Vec::new());
     let runtime = service::reactor()?;
     let token = Token::random().map_err(|error| Failure::system(format!("no token can be made: {error}")))?;
     let listener = runtime.block_on(service::bind(([127, 0, 0, 1], 0).into()))?;

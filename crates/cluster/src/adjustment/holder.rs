@@ -15,7 +15,7 @@ pub struct HolderOptions {
     pub endpoint: Endpoint,
     /// A name for the log.
     pub name: String,
-    /// Memory for parts and their factors, in bytes.
+    /// Memory that the process may use, in bytes.
     pub memory_bytes: u64,
     /// Where the parts lie.
     pub store: Arc<dyn PartStore>,
@@ -74,11 +74,10 @@ impl Holder {
         let failed = |error: &dyn std::error::Error| ClusterError::failed(chain(error));
         match FromSolver::decode(message).map_err(|error| failed(&error))? {
             FromSolver::Setup { side, step, cameras } => {
-                let mut worker = PartWorker::new(
-                    Arc::new(*side),
-                    Some(self.options.store.clone()),
-                    self.options.memory_bytes,
-                );
+                let parts_bytes =
+                    self.options.memory_bytes.saturating_sub(overhead_bytes(side.problem().poses.len()));
+                let mut worker =
+                    PartWorker::new(Arc::new(*side), Some(self.options.store.clone()), parts_bytes);
                 worker.resume(step, &cameras).map_err(|error| failed(&error))?;
                 self.worker = Some(worker);
             }
@@ -115,6 +114,11 @@ impl Holder {
         }
         Ok(())
     }
+}
+
+/// What a holder takes beside its parts: itself, the cameras as they are accepted and tried, and messages about them.
+fn overhead_bytes(num_poses: usize) -> u64 {
+    (64 << 20) + 2560 * num_poses as u64
 }
 
 fn too_early() -> ClusterError {

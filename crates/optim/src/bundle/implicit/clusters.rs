@@ -100,13 +100,28 @@ pub(super) fn make_parts(
     dropped: &[Dropped],
     clusters: &Clusters,
 ) -> Result<Parted, BundleError> {
-    let mut builders: Vec<Builder> = (0..clusters.count).map(|_| Builder::default()).collect();
     let mut tally = vec![0u32; clusters.count];
+    // Counted first, so that every array is made once, at its size.
+    let mut counts = vec![(0usize, 0usize); clusters.count];
+    for (index, dropped) in dropped.iter().enumerate() {
+        let shard = shards.load(index)?;
+        for_each_point(&shard, dropped, clusters, &mut tally, |cluster, _, seen| {
+            let (points, observations) = &mut counts[cluster as usize];
+            (*points, *observations) = (*points + 1, *observations + seen.len());
+        });
+    }
+    let mut builders: Vec<Builder> = counts.into_iter().map(Builder::with_capacity).collect();
     for fixed in [false, true] {
         for (index, dropped) in dropped.iter().enumerate() {
             let shard = shards.load(index)?;
             if shard.fixed_points == fixed {
-                add_shard(&shard, index as u32, dropped, clusters, &mut tally, &mut builders);
+                for_each_point(&shard, dropped, clusters, &mut tally, |cluster, point, seen| {
+                    let builder = &mut builders[cluster as usize];
+                    let local = builder.points.len() as u32;
+                    builder.points.push(shard.points[point as usize]);
+                    builder.origins.push((index as u32, point));
+                    builder.observations.extend(seen.iter().map(|(pose, xy_px)| (*pose, local, *xy_px)));
+                });
             }
         }
         if !fixed {
@@ -117,13 +132,13 @@ pub(super) fn make_parts(
     Ok(Parted { parts, origins })
 }
 
-fn add_shard(
+/// Calls `visit` with the cluster, the index and the observations of every point of a shard that takes part.
+fn for_each_point(
     shard: &BundleShard,
-    index: u32,
     dropped: &Dropped,
     clusters: &Clusters,
     tally: &mut [u32],
-    builders: &mut [Builder],
+    mut visit: impl FnMut(u32, u32, &[(u32, [f32; 2])]),
 ) {
     let mut skip = dropped.observations.iter().copied().peekable();
     let mut next = 0;
@@ -137,12 +152,9 @@ fn add_shard(
             }
             next += 1;
         }
-        let Some(cluster) = majority(&seen, clusters, tally) else { continue };
-        let builder = &mut builders[cluster as usize];
-        let local = builder.points.len() as u32;
-        builder.points.push(shard.points[point as usize]);
-        builder.origins.push((index, point));
-        builder.observations.extend(seen.iter().map(|(pose, xy_px)| (*pose, local, *xy_px)));
+        if let Some(cluster) = majority(&seen, clusters, tally) {
+            visit(cluster, point, &seen);
+        }
     }
 }
 
@@ -159,7 +171,6 @@ fn majority(seen: &[(u32, [f32; 2])], clusters: &Clusters, tally: &mut [u32]) ->
 }
 
 /// A part that grows point by point.
-#[derive(Default)]
 struct Builder {
     points: Vec<Vector3<f64>>,
     free_points: usize,
@@ -168,6 +179,15 @@ struct Builder {
 }
 
 impl Builder {
+    fn with_capacity((points, observations): (usize, usize)) -> Self {
+        Self {
+            points: Vec::with_capacity(points),
+            free_points: 0,
+            origins: Vec::with_capacity(points),
+            observations: Vec::with_capacity(observations),
+        }
+    }
+
     fn finish(mut self) -> (Part, Vec<(u32, u32)>) {
         self.observations.sort_by_key(|(pose, _, _)| *pose);
         let mut part = Part {

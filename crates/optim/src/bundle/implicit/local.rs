@@ -124,6 +124,9 @@ impl<T: Real> PartState<T> {
         factor.owned = owned;
         factor.columns.clear();
         factor.inverse.clear();
+        // All factors of a holder together are most of its memory: no room to grow.
+        factor.columns.reserve_exact(n * n.saturating_sub(1) / 2);
+        factor.inverse.reserve_exact(n);
         for column in 0..n {
             let values = matrix.column(column);
             if held {

@@ -158,7 +158,9 @@ impl<T: Real> PartState<T> {
 /// The lanes of a part, without values.
 fn lane_arrays<T: Real>(part: &Part, stride: usize) -> LaneArrays<T> {
     let none = part.points.len() as u32;
-    let (mut first_group, mut points) = (vec![0u32], Vec::new());
+    let cameras = part.first_observation.windows(2);
+    let groups = cameras.map(|w| ((w[1] - w[0]) as usize).div_ceil(LANES)).sum();
+    let (mut first_group, mut points) = (vec![0u32], Vec::with_capacity(groups));
     for window in part.first_observation.windows(2) {
         for chunk in part.point_of[window[0] as usize..window[1] as usize].chunks(LANES) {
             let mut lanes = [none; LANES];
