@@ -56,7 +56,7 @@ pub enum FromHolder {
 
 #[derive(Serialize, Deserialize)]
 enum SolverRecord {
-    Setup { problem: BundleProblem, options: BundleOptions, step: u64 },
+    Setup { problem: Box<BundleProblem>, options: Box<BundleOptions>, step: u64 },
     Take,
     Ask { number: u64, some: bool, what: RequestRecord },
 }
@@ -107,8 +107,8 @@ impl FromSolver {
         match self {
             Self::Setup { side, step, cameras } => {
                 let record = SolverRecord::Setup {
-                    problem: side.problem().clone(),
-                    options: side.options().clone(),
+                    problem: Box::new(side.problem().clone()),
+                    options: Box::new(side.options().clone()),
                     step: *step,
                 };
                 let observed: Vec<u32> = side.observed().iter().map(|seen| u32::from(*seen)).collect();
@@ -157,7 +157,7 @@ impl FromSolver {
                     return Err(SceneError::invalid("the cameras of the adjustment contradict each other"));
                 }
                 let observed = observed.iter().map(|seen| *seen != 0).collect();
-                let side = CameraSide::new(problem, options, observed, Clusters::new(indices));
+                let side = CameraSide::new(*problem, *options, observed, Clusters::new(indices));
                 Self::Setup { side: Box::new(side), step, cameras: numbers }
             }
             SolverRecord::Take => Self::Take(indices),
