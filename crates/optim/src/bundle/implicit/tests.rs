@@ -31,6 +31,8 @@ fn options(solver: BundleSolver) -> BundleOptions {
         cluster_poses: 7,
         cost_tolerance: 1e-13,
         linear_tolerance: 1e-3,
+        // Re-weighting creeps where the loss bends.
+        max_iterations: 200,
         ..Default::default()
     }
 }
@@ -59,20 +61,18 @@ fn explicit_and_implicit_find_the_same_minimum() {
             })
             .collect();
         start.0.focal_priors = vec![FocalPrior { intrinsics: 0, focal_px: 890.0, sigma_px: 3.0 }];
-        for loss in [Loss::Squared, Loss::Huber, Loss::Cauchy, Loss::GemanMcclure] {
+        // Under a loss that is not convex, re-weighting creeps, and the two ways may end in neighbouring valleys.
+        for loss in [Loss::Squared, Loss::Huber, Loss::SoftL1, Loss::Cauchy] {
             let with = |solver, precision| BundleOptions { loss, precision, ..options(solver) };
             let explicit = solved(&start, &with(BundleSolver::Explicit, Precision::Double)).0;
             for precision in [Precision::Single, Precision::Double] {
                 let (implicit, problem, _) = solved(&start, &with(BundleSolver::Implicit, precision));
                 assert!((implicit.initial_cost / explicit.initial_cost - 1.0).abs() < 1e-12);
                 let difference = (implicit.final_cost / explicit.final_cost - 1.0).abs();
-                // Geman & McClure's loss is not convex, and re-weighting creeps: both ways are on it still.
-                let creeps = loss == Loss::GemanMcclure;
-                let bound = if creeps { 1e-6 } else { 1e-8 };
-                assert!(difference < bound, "{num_intrinsics} {loss:?} {precision:?}: {difference:e}");
+                assert!(difference < 1e-8, "{num_intrinsics} {loss:?} {precision:?}: {difference:e}");
                 assert!(implicit.clusters >= 4 && implicit.linear_iterations > 0, "{implicit:?}");
                 assert_eq!(problem.poses[3], start.0.poses[3], "a held pose moved");
-                assert!(creeps || implicit.termination.converged(), "{loss:?} {precision:?}: {implicit:?}");
+                assert!(implicit.termination.converged(), "{loss:?} {precision:?}: {implicit:?}");
             }
         }
     }
