@@ -1,3 +1,5 @@
+//! Poses and focal lengths of random scenes, exact, noisy and degenerate.
+
 use super::*;
 use crate::small_lm::tests::assert_gradient;
 use crate::test_support::{Random, project};

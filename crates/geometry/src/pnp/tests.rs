@@ -1,3 +1,5 @@
+//! Poses of random scenes by many points, exact, noisy and degenerate.
+
 use nalgebra::Vector2;
 
 use super::*;
