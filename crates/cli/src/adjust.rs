@@ -36,8 +36,8 @@ enum Source {
 
 /// Reads, solves, writes, prints.
 pub fn adjust(flags: &AdjustFlags, json: bool) -> Result<(), Failure> {
-    let threads = flags.threads.map_or(0, |threads| threads.get() as usize);
-    // Zero means all cores.
+    // Zero means all cores, which are this process's own until workers start.
+    let threads = flags.threads.filter(|_| flags.workers == 0).map_or(0, |threads| threads.get() as usize);
     let built = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
     built.map_err(|error| Failure::system(format!("no threads can be had: {error}")))?;
     let mut options = BundleOptions {

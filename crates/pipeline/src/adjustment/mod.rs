@@ -16,6 +16,7 @@ pub use terrane_optim::bundle::{
 };
 
 use nalgebra::Vector3;
+use rayon::prelude::*;
 
 use crate::PipelineError;
 
@@ -44,12 +45,16 @@ pub fn store_parts(
 ) -> Result<Stored, PipelineError> {
     let Partition { side, parts, origins, report } = partition(&whole.problem, &whole.shards, options)
         .map_err(|error| PipelineError::invalid_input(error.to_string()))?;
-    let (mut poses, mut weights) = (Vec::with_capacity(parts.len()), Vec::with_capacity(parts.len()));
-    for (index, part) in parts.into_iter().enumerate() {
-        store.put(index as u32, &part)?;
-        weights.push(part.num_observations() as u64);
-        poses.push(part.poses);
-    }
+    let written: Vec<(Vec<u32>, u64)> = parts
+        .into_par_iter()
+        .enumerate()
+        .map(|(index, part)| {
+            store.put(index as u32, &part)?;
+            let weight = part.num_observations() as u64;
+            Ok((part.poses, weight))
+        })
+        .collect::<Result<_, PipelineError>>()?;
+    let (poses, weights) = written.into_iter().unzip();
     Ok(Stored { side: side.into(), poses, weights, report, origins })
 }
 

@@ -1,6 +1,7 @@
 //! Clusters of cameras that look at the same place, and the points that each sees most of.
 
 use nalgebra::{Vector3, Vector6};
+use rayon::prelude::*;
 
 use super::super::plan::Dropped;
 use super::super::{BundleError, BundleProblem, BundleShard, Shards};
@@ -128,7 +129,8 @@ pub(super) fn make_parts(
             builders.iter_mut().for_each(|builder| builder.free_points = builder.points.len());
         }
     }
-    let (parts, origins) = builders.into_iter().map(Builder::finish).unzip();
+    let finished: Vec<(Part, Vec<(u32, u32)>)> = builders.into_par_iter().map(Builder::finish).collect();
+    let (parts, origins) = finished.into_iter().unzip();
     Ok(Parted { parts, origins })
 }
 

@@ -100,7 +100,6 @@ impl<T: Real> PartState<T> {
     /// What the part's points add to `Pᵀ S P`, dense over the groups that they touch: a lower triangle, column-major.
     ///
     /// Points whose cameras all belong to one cluster follow it for free, but for the damping of points, which is left out.
-    #[inline(never)]
     pub fn coarse_matrix(
         &self,
         frame: &Frame<'_>,

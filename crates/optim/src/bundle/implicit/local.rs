@@ -48,7 +48,6 @@ pub(super) struct LocalFactor<T> {
 
 impl<T: Real> LocalFactor<T> {
     /// Solves for the cluster's cameras: reads `right`, the vector of all unknowns, and returns the local solution.
-    #[inline(never)]
     pub fn solve(&mut self, map: &CameraMap, right: &[f64]) -> Vec<f64> {
         let Self { owned, columns, inverse, work } = self;
         work.clear();
@@ -101,7 +100,6 @@ fn owned_cameras(map: &CameraMap, members: &[u32], poses: &[u32]) -> Vec<Owned> 
 
 impl<T: Real> PartState<T> {
     /// Builds and factorises the block of cluster `cluster`; `diagonal` holds the packed diagonal block of every pose.
-    #[inline(never)]
     pub fn factorize_local(&mut self, frame: &Frame<'_>, cluster: usize, diagonal: &[f64]) {
         let owned = owned_cameras(frame.map, &frame.clusters.members[cluster], &self.part.poses);
         let n = owned.last().map_or(0, |last| last.offset as usize + last.num_rows());

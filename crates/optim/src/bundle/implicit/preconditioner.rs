@@ -29,18 +29,17 @@ impl BlockFactors {
         let listed = side.map.of_pose.iter().zip(blocks.chunks_exact(packed(width))).filter(|_| poses);
         for (unknowns, block) in listed.filter(|(unknowns, _)| unknowns.pose != NONE) {
             let own = if unknowns.own { unknowns.num_intrinsics as usize } else { 0 };
-            let row = |i: usize| i;
-            factors.push([(unknowns.pose as usize, 6), (unknowns.intrinsics as usize, own)], block, row);
+            factors.push([(unknowns.pose as usize, 6), (unknowns.intrinsics as usize, own)], block);
         }
         for ((first, n), block) in side.map.shared.iter().zip(shared) {
-            factors.push([(*first as usize, *n as usize), (0, 0)], block, |i| i);
+            factors.push([(*first as usize, *n as usize), (0, 0)], block);
         }
         factors
     }
 
-    fn push(&mut self, ranges: [(usize, usize); 2], block: &[f64], row: impl Fn(usize) -> usize) {
+    fn push(&mut self, ranges: [(usize, usize); 2], block: &[f64]) {
         let n = ranges[0].1 + ranges[1].1;
-        let at = |i: usize, j: usize| block[packed(row(i).max(row(j))) + row(i).min(row(j))];
+        let at = |i: usize, j: usize| block[packed(i.max(j)) + i.min(j)];
         let matrix = nalgebra::DMatrix::from_fn(n, n, at);
         let factor = matrix.clone().cholesky().map_or_else(
             // A block that rounding has spoiled: its diagonal.

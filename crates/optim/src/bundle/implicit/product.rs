@@ -47,7 +47,6 @@ impl<T: Real> Scratch<T> {
 
 impl<T: Real> LaneArrays<T> {
     /// `y = S x` over this part; both hold `6 + stride` values for each of its cameras.
-    #[inline(never)]
     pub fn multiply(&self, stride: usize, x: &[f64], y: &mut [f64], scratch: &mut Scratch<T>) {
         scratch.image.resize(self.points.len(), [splat(T::default()); 2]);
         scratch.point.clear();

@@ -97,7 +97,6 @@ impl<T: Real> PartState<T> {
     }
 
     /// Residuals and Jacobians of all observations, at the accepted points.
-    #[inline(never)]
     pub fn linearise(&mut self, frame: &Frame<'_>) {
         let width = frame.map.width();
         let num_cameras = self.part.poses.len();
@@ -126,7 +125,6 @@ impl<T: Real> PartState<T> {
     }
 
     /// Eliminates the points with this damping; the largest `g² / D` of a point's coordinate.
-    #[inline(never)]
     pub fn eliminate(&mut self, damping: f64) -> f64 {
         let mut steepest = 0.0f64;
         for (point, normal) in self.normal.iter().enumerate() {
@@ -146,7 +144,6 @@ impl<T: Real> PartState<T> {
     }
 
     /// What remains of the cameras' blocks and gradients after [`PartState::eliminate`].
-    #[inline(never)]
     pub fn camera_sums(&self, stride: usize, steepest: f64) -> CameraSums {
         let normal = self.lanes.normal_blocks(stride);
         let (mut reduced, mut reduced_gradient) = (normal.clone(), self.gradient.clone());

@@ -13,7 +13,6 @@ const MAX_HALVINGS: u32 = 3;
 
 impl<T: Real> PartState<T> {
     /// Tries the step of the cameras (`6 + stride` values for each of the part's) that leads to `next`.
-    #[inline(never)]
     pub fn try_step(&mut self, frame: &Frame<'_>, damping: f64, step: &[f64], next: &Cameras) -> Tried {
         let mut tried = Tried::default();
         let mut steps = vec![Vector3::zeros(); self.part.points.len()];
