@@ -57,6 +57,29 @@ impl Request {
     }
 }
 
+/// A group of figures: its name, and what measures it.
+pub type Section = (&'static str, fn(&Request) -> anyhow::Result<Vec<table::Row>>);
+
+/// Measures the sections that the command line asks for; prints rows as they become known, and writes them where asked.
+///
+/// # Errors
+/// A bad command line, a section that fails, or a file that can't be written.
+pub fn run(sections: &[Section]) -> anyhow::Result<()> {
+    let request = Request::from_args()?;
+    let mut rows = Vec::new();
+    for (name, section) in sections.iter().filter(|(name, _)| request.wants(name)) {
+        println!("{name}");
+        for row in section(&request)? {
+            table::print(&row);
+            rows.push(row);
+        }
+    }
+    if let Some(path) = &request.json {
+        table::write_json(path, &rows)?;
+    }
+    Ok(())
+}
+
 /// The folder of photographs with known answers: `TERRANE_DATA`, or `../shared/data` beside the checkout.
 pub fn data() -> PathBuf {
     std::env::var_os("TERRANE_DATA").map_or_else(|| root().join("../shared/data"), PathBuf::from)

@@ -8,11 +8,7 @@ mod peers;
 mod problems;
 mod scaling;
 
-use terrane_benches::Request;
-use terrane_benches::table::{self, Row};
-
-/// A group of figures.
-type Section = (&'static str, fn(&Request) -> anyhow::Result<Vec<Row>>);
+use terrane_benches::Section;
 
 const SECTIONS: &[Section] = &[
     ("real", problems::real),
@@ -24,17 +20,5 @@ const SECTIONS: &[Section] = &[
 ];
 
 fn main() -> anyhow::Result<()> {
-    let request = Request::from_args()?;
-    let mut rows = Vec::new();
-    for (name, section) in SECTIONS.iter().filter(|(name, _)| request.wants(name)) {
-        println!("{name}");
-        for row in section(&request)? {
-            table::print(&row);
-            rows.push(row);
-        }
-    }
-    if let Some(path) = &request.json {
-        table::write_json(path, &rows)?;
-    }
-    Ok(())
+    terrane_benches::run(SECTIONS)
 }

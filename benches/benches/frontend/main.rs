@@ -16,11 +16,7 @@ mod surveyed;
 mod two_views;
 mod whole;
 
-use terrane_benches::Request;
-use terrane_benches::table::{self, Row};
-
-/// A group of figures.
-type Section = (&'static str, fn(&Request) -> anyhow::Result<Vec<Row>>);
+use terrane_benches::Section;
 
 const SECTIONS: &[Section] = &[
     ("extraction", extraction::rows),
@@ -38,17 +34,5 @@ fn main() -> anyhow::Result<()> {
     if let Some(outcome) = memory::as_child() {
         return outcome;
     }
-    let request = Request::from_args()?;
-    let mut rows = Vec::new();
-    for (name, section) in SECTIONS.iter().filter(|(name, _)| request.wants(name)) {
-        println!("{name}");
-        for row in section(&request)? {
-            table::print(&row);
-            rows.push(row);
-        }
-    }
-    if let Some(path) = &request.json {
-        table::write_json(path, &rows)?;
-    }
-    Ok(())
+    terrane_benches::run(SECTIONS)
 }

@@ -6,20 +6,21 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use terrane_cluster::Token;
 use terrane_cluster::adjustment::{HolderOptions, RemoteHost, RemoteOptions};
 use terrane_cluster::local::{LocalOptions, LocalWorkers, die_with_parent};
+use terrane_cluster::{Token, with_causes};
 use terrane_pipeline::Store;
 use terrane_pipeline::adjustment::{
     self, BundleError, BundleOptions, BundleReport, LocalHost, PartWorker, RefineIntrinsics, ResidualFigures,
     StoredParts, WholeProblem, problems,
 };
+use terrane_pipeline::resources::peak_resident_bytes;
 use terrane_scene::bal;
 use terrane_scene::colmap::{self, ColmapModel, ModelFiles};
 
 use crate::args::{AdjustFlags, HoldFlags};
 use crate::exit::Failure;
-use crate::machine::{self, Share};
+use crate::machine::Share;
 use crate::{log, models, service};
 
 /// Parts lie in this folder of the scratch store.
@@ -252,9 +253,7 @@ pub fn hold(flags: HoldFlags) -> Result<(), Failure> {
     if let Some(parent) = flags.parent {
         die_with_parent(parent)?;
     }
-    let one = std::num::NonZeroU32::new(1);
-    let threads = flags.threads.or_else(|| std::num::NonZeroU32::new(machine::cores()));
-    let Share { threads, memory_bytes, .. } = Share::resolve(one, threads, flags.memory);
+    let Share { threads, memory_bytes, .. } = Share::alone(flags.threads, flags.memory);
     let built = rayon::ThreadPoolBuilder::new().num_threads(threads as usize).build_global();
     built.map_err(|error| Failure::system(format!("no threads can be had: {error}")))?;
     let store = Store::local(&flags.scratch).map_err(|error| Failure::system(error.to_string()))?;
@@ -278,16 +277,6 @@ fn stored_badly(error: terrane_pipeline::PipelineError) -> Failure {
     } else {
         Failure::system(error.to_string())
     }
-}
-
-fn with_causes(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(error) = cause {
-        text.push_str(&format!(": {error}"));
-        cause = error.source();
-    }
-    text
 }
 
 /// What is told at the end.
@@ -323,7 +312,7 @@ impl Outcome<'_> {
             "after": figures(&self.after),
             "read_seconds": self.read_seconds,
             "solve_seconds": self.solve_seconds,
-            "peak_bytes": machine::peak_bytes(),
+            "peak_bytes": peak_resident_bytes().unwrap_or(0),
         })
     }
 
@@ -369,7 +358,7 @@ impl Outcome<'_> {
             "time           {:.2} s to read, {:.2} s to solve\npeak memory    {} MiB\n",
             self.read_seconds,
             self.solve_seconds,
-            machine::peak_bytes() >> 20
+            peak_resident_bytes().unwrap_or(0) >> 20
         ));
         text
     }

@@ -20,14 +20,6 @@ pub fn memory_bytes() -> u64 {
     machine.min(group.unwrap_or(u64::MAX))
 }
 
-/// The most memory that this process has had resident, in bytes; zero when the system does not say.
-pub fn peak_bytes() -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-    line.and_then(|line| line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok())
-        .map_or(0, |kib| kib * 1024)
-}
-
 /// A name for a worker of this process.
 pub fn worker_name() -> String {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
@@ -53,6 +45,12 @@ impl Share {
     /// What was asked for, completed from what the machine has.
     pub fn resolve(workers: Option<NonZeroU32>, threads: Option<NonZeroU32>, memory: Option<u64>) -> Self {
         Self::of(cores(), self::memory_bytes(), (workers, threads, memory))
+    }
+
+    /// The same for a process that has the machine, or what was asked of it, to itself.
+    pub fn alone(threads: Option<NonZeroU32>, memory: Option<u64>) -> Self {
+        let threads = threads.or_else(|| NonZeroU32::new(cores()));
+        Self::resolve(NonZeroU32::new(1), threads, memory)
     }
 
     fn of(

@@ -114,9 +114,7 @@ pub async fn worker(flags: WorkerFlags) -> Result<(), Failure> {
     if let Some(parent) = flags.parent {
         die_with_parent(parent)?;
     }
-    let one = std::num::NonZeroU32::new(1);
-    let threads = flags.threads.or_else(|| std::num::NonZeroU32::new(machine::cores()));
-    let Share { threads, memory_bytes, .. } = Share::resolve(one, threads, flags.memory);
+    let Share { threads, memory_bytes, .. } = Share::alone(flags.threads, flags.memory);
     let offer = Registration {
         name: flags.name.unwrap_or_else(machine::worker_name),
         memory_bytes,

@@ -16,6 +16,6 @@ pub mod state;
 mod tests;
 pub mod worker;
 
-pub use error::ClusterError;
+pub use error::{ClusterError, with_causes};
 pub use terrane_proto::types;
 pub use terrane_proto::{Client, Endpoint, ProtoError, Token};

@@ -7,6 +7,7 @@ use terrane_pipeline::adjustment::{FromHolder, FromSolver, PartRequest, PartStor
 use terrane_proto::{Endpoint, LinkReceiver, LinkSender};
 
 use crate::ClusterError;
+use crate::error::with_causes;
 
 /// How a holder works.
 #[derive(Clone)]
@@ -71,13 +72,12 @@ impl Holder {
     }
 
     fn handle(&mut self, message: &[u8]) -> Result<(), ClusterError> {
-        let failed = |error: &dyn std::error::Error| ClusterError::failed(chain(error));
+        let failed = |error: &dyn std::error::Error| ClusterError::failed(with_causes(error));
         match FromSolver::decode(message).map_err(|error| failed(&error))? {
             FromSolver::Setup { side, step, cameras } => {
                 let parts_bytes =
                     self.options.memory_bytes.saturating_sub(overhead_bytes(side.problem().poses.len()));
-                let mut worker =
-                    PartWorker::new(Arc::new(*side), Some(self.options.store.clone()), parts_bytes);
+                let mut worker = PartWorker::new(side, Some(self.options.store.clone()), parts_bytes);
                 worker.resume(step, &cameras).map_err(|error| failed(&error))?;
                 self.worker = Some(worker);
             }
@@ -103,11 +103,12 @@ impl Holder {
         request: &PartRequest,
     ) -> Result<(), ClusterError> {
         let worker = self.worker.as_mut().ok_or_else(too_early)?;
-        worker.begin(request);
+        worker.begin(request).map_err(|error| ClusterError::failed(with_causes(&error)))?;
         let parts = only.unwrap_or_else(|| worker.held().map(|(part, _)| part).collect());
         for parts in parts.chunks(PARTS_AT_ONCE) {
-            let answers =
-                worker.answer(request, Some(parts)).map_err(|error| ClusterError::failed(chain(&error)))?;
+            let answers = worker
+                .answer(request, Some(parts))
+                .map_err(|error| ClusterError::failed(with_causes(&error)))?;
             if !self.sender.blocking_send(encode(&FromHolder::Answers { number, answers })?) {
                 return Ok(());
             }
@@ -127,16 +128,4 @@ fn too_early() -> ClusterError {
 
 fn encode(message: &FromHolder) -> Result<Bytes, ClusterError> {
     message.encode().map_err(|error| ClusterError::failed(error.to_string()))
-}
-
-/// An error with its causes.
-pub(super) fn chain(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(error) = cause {
-        text.push_str(": ");
-        text.push_str(&error.to_string());
-        cause = error.source();
-    }
-    text
 }

@@ -162,14 +162,8 @@ impl RemoteHost {
         };
         if !holder.ready {
             // A holder that knows nothing is told everything.
-            let copy = CameraSide::new(
-                self.side.problem().clone(),
-                self.side.options().clone(),
-                self.side.observed().to_vec(),
-                self.side.clusters().clone(),
-            );
-            let (step, cameras) = (self.step, self.cameras.clone());
-            messages.push(FromSolver::Setup { side: Box::new(copy), step, cameras });
+            let (side, step, cameras) = (self.side.clone(), self.step, self.cameras.clone());
+            messages.push(FromSolver::Setup { side, step, cameras });
             holder.ready = true;
         }
         holder.weight += parts.iter().map(|part| self.weights[*part as usize]).sum::<u64>();

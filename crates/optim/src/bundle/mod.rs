@@ -4,8 +4,9 @@
 //! poses (six unknowns on the left of `cam_from_world`) and refined intrinsics, solved by a sparse or dense Cholesky
 //! factorisation. Robust losses act by re-weighting.
 //!
-//! Observations whose point starts behind the camera take no part in the solve, unless [`BehindCamera::Mirror`] says so. A step that would carry a point behind
-//! a camera is shortened for this point; if that does not help it counts as no descent.
+//! Observations whose point starts behind the camera take no part in the solve, unless [`BehindCamera::Mirror`] says
+//! so. A step that would carry a point behind a camera is shortened for this point; if that does not help it counts as no
+//! descent.
 
 mod explicit;
 pub mod implicit;

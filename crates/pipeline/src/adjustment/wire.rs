@@ -1,5 +1,7 @@
 //! What the two ends of a distributed adjustment say to each other: a small record, and vectors as they lie in memory.
 
+use std::sync::Arc;
+
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 use terrane_optim::bundle::implicit::{CameraSide, Clusters, PartRequest};
@@ -17,7 +19,7 @@ pub enum FromSolver {
     /// The cameras of the problem, where they were accepted last, and how much memory parts may take.
     Setup {
         /// The camera side.
-        side: Box<CameraSide>,
+        side: Arc<CameraSide>,
         /// Accepted steps so far.
         step: u64,
         /// The accepted cameras as numbers.
@@ -158,7 +160,7 @@ impl FromSolver {
                 }
                 let observed = observed.iter().map(|seen| *seen != 0).collect();
                 let side = CameraSide::new(*problem, *options, observed, Clusters::new(indices));
-                Self::Setup { side: Box::new(side), step, cameras: numbers }
+                Self::Setup { side: Arc::new(side), step, cameras: numbers }
             }
             SolverRecord::Take => Self::Take(indices),
             SolverRecord::Ask { number, some, what } => {

@@ -27,7 +27,7 @@ pub struct LocalHost(pub PartWorker);
 
 impl PartHost for LocalHost {
     fn ask(&mut self, request: &PartRequest) -> Result<Vec<Vec<f64>>, BundleError> {
-        self.0.begin(request);
+        self.0.begin(request)?;
         Ok(self.0.answer(request, None)?.into_iter().map(|(_, answer)| answer).collect())
     }
 }

@@ -21,8 +21,8 @@ struct BlockFactor {
 }
 
 impl BlockFactors {
-    /// Factors of the blocks of free poses (with their own intrinsics) for which `wanted` holds, and of all intrinsics
-    /// that poses share. `blocks` are packed, one a pose; `shared` follow the list of the map.
+    /// Factors of the blocks of free poses with their own intrinsics, where `poses` says so, and of all intrinsics that
+    /// poses share. `blocks` are packed, one a pose; `shared` follow the list of the map.
     pub fn new(side: &CameraSide, blocks: &[f64], shared: &[Vec<f64>], poses: bool) -> Self {
         let width = side.map.width();
         let mut factors = Self { blocks: Vec::new() };
@@ -99,6 +99,14 @@ impl Coarse {
         // A pose without observations still ties its cluster to its intrinsics: both lie on the diagonal.
         let system = BlockSystem::new(BlockPattern::new(&dims, above), LinearSolver::Simplicial)?;
         Ok(Self { system, touched, columns: Vec::new(), holds: false })
+    }
+
+    /// How many numbers the matrix of each part has.
+    pub fn part_lengths(&self, side: &CameraSide) -> impl Iterator<Item = usize> {
+        let dims = side.coarse.dims();
+        self.touched
+            .iter()
+            .map(move |groups| groups.iter().map(|group| dims[*group as usize]).sum::<usize>().pow(2))
     }
 
     /// Adds the parts' matrices, and what damping and priors put on the diagonal blocks of cameras.

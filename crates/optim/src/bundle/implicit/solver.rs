@@ -240,6 +240,7 @@ impl<'a> Driver<'a> {
             let (pose_priors, shared_priors) = coarse_priors(&side, &sums.priors);
             let extra =
                 Extra { damping: &sums.damping, pose_priors: &pose_priors, shared_priors: &shared_priors };
+            check_lengths(&answers, coarse.part_lengths(&side))?;
             coarse.assemble(&side, &self.cameras, &answers, &extra);
         }
         Ok(())
@@ -249,6 +250,10 @@ impl<'a> Driver<'a> {
 impl Backend for Driver<'_> {
     fn linearise(&mut self, damping: f64, anew: bool) -> Result<Linearised, BundleError> {
         let answers = self.host.ask(&PartRequest::Linearise { damping, anew })?;
+        let blocks = 1 + usize::from(self.inverse.kind == Preconditioner::PowerSeries);
+        let (width, of) = (self.side.map.width(), |poses: &Vec<u32>| poses.len());
+        let lengths = self.poses.iter().map(of).map(|n| 2 + n * (3 * width + blocks * packed(width)));
+        check_lengths(&answers, lengths)?;
         let mut cost = self.gather(&answers);
         self.add_priors();
         cost += prior_cost(&self.side.problem, &self.side.layout, &self.cameras, &self.side.options);
@@ -317,6 +322,16 @@ impl Backend for Driver<'_> {
             self.cameras = next;
         }
         Ok(())
+    }
+}
+
+/// Answers may come from another process: a wrong length is an error, not a panic.
+fn check_lengths(answers: &[Vec<f64>], lengths: impl Iterator<Item = usize>) -> Result<(), BundleError> {
+    match answers.iter().map(Vec::len).eq(lengths) {
+        true => Ok(()),
+        false => Err(BundleError::lost(
+            "a holder's answer has a wrong length: solver and holder differ in version".into(),
+        )),
     }
 }
 

@@ -311,3 +311,24 @@ fn outliers_with_a_robust_loss_leave_centres_where_they_were() {
     let (clean, spoiled) = (error(false), error(true));
     assert!(clean > 1e-5 && clean < 0.02 && spoiled < 1.5 * clean, "{clean} {spoiled}");
 }
+
+#[test]
+fn questions_that_do_not_fit_are_errors() {
+    let start = scene(0);
+    let shards = InMemoryShards(vec![start.1.clone()]);
+    let Partition { side, mut parts, .. } =
+        partition(&start.0, &shards, &options(BundleSolver::Implicit)).unwrap();
+    let (part, count) = (parts.swap_remove(0), parts.len() as u32 + 1);
+    let mut worker = PartWorker::new(Arc::new(side), None, u64::MAX);
+    assert!(worker.take(count, part.clone()).unwrap_err().to_string().contains("no cluster"));
+    worker.take(0, part).unwrap();
+    for request in [
+        PartRequest::Multiply(vec![1.0; 5]),
+        PartRequest::Solve(Vec::new()),
+        PartRequest::Try { damping: 1e-4, step: vec![0.0; 3] },
+        PartRequest::Prepare { diagonal: vec![1.0; 7], coarse: false },
+    ] {
+        let error = worker.begin(&request).unwrap_err();
+        assert!(error.is_invalid_input() && error.to_string().contains("numbers"), "{request:?}: {error}");
+    }
+}

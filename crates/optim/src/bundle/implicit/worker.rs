@@ -209,6 +209,9 @@ impl PartWorker {
     /// When the part is not valid.
     pub fn take(&mut self, index: u32, part: Part) -> Result<(), BundleError> {
         part.validate(index as usize, self.side.problem.poses.len())?;
+        let Some(members) = self.side.clusters.members.get(index as usize) else {
+            return Err(BundleError::invalid(format!("part {index} has no cluster: the problem has fewer")));
+        };
         let stride = self.side.map.stride;
         let double = self.side.options.precision == Precision::Double;
         let bytes = if double {
@@ -217,8 +220,7 @@ impl PartWorker {
             PartState::<f32>::held_bytes(&part, stride)
         };
         // The cluster's factor stays in any case.
-        let unknowns =
-            self.side.map.width() * self.side.clusters.members.get(index as usize).map_or(0, Vec::len);
+        let unknowns = self.side.map.width() * members.len();
         let factor = (unknowns * (unknowns + 1) / 2 * if double { 8 } else { 4 }) as u64;
         self.memory_bytes = self.memory_bytes.saturating_sub(factor);
         let resident = self.store.is_none() || bytes <= self.memory_bytes;
@@ -252,7 +254,24 @@ impl PartWorker {
     }
 
     /// What a request changes for all parts; before they are asked to answer it.
-    pub fn begin(&mut self, request: &PartRequest) {
+    ///
+    /// # Errors
+    /// When a vector is not as long as that of all unknowns.
+    pub fn begin(&mut self, request: &PartRequest) -> Result<(), BundleError> {
+        let map = &self.side.map;
+        let (length, expected) = match request {
+            PartRequest::Multiply(x) | PartRequest::Solve(x) => (x.len(), map.num_unknowns),
+            PartRequest::Try { step, .. } => (step.len(), map.num_unknowns),
+            PartRequest::Prepare { diagonal, .. } if !diagonal.is_empty() => {
+                (diagonal.len(), packed(map.width()) * map.of_pose.len())
+            }
+            _ => (0, 0),
+        };
+        if length != expected {
+            return Err(BundleError::invalid(format!(
+                "a question with {length} numbers where {expected} are needed: solver and holder differ in version"
+            )));
+        }
         match request {
             PartRequest::Accept => {
                 if let Some(next) = self.next.take() {
@@ -263,6 +282,7 @@ impl PartWorker {
             PartRequest::Linearise { damping, .. } => self.damping = *damping,
             _ => {}
         }
+        Ok(())
     }
 
     /// Answers for every part, ascending, or only for those in `only`, after [`PartWorker::begin`]. What the numbers are
