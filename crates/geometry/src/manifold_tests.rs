@@ -210,3 +210,17 @@ fn sim3_obeys_the_laws() {
         assert!((seen - cam_from_a.transform_point(&x_in_a)).norm() < 1e-9);
     }
 }
+
+#[test]
+fn left_jacobian_inverse_is_the_slope_of_the_logarithm() {
+    for length in [0.0, 1e-6, 9e-3, 1.1e-2, 0.5, 2.0, 3.0] {
+        let omega = Vector3::new(0.6, -0.48, 0.64) * length;
+        let jacobian = so3::left_jacobian_inverse(&omega);
+        for axis in 0..3 {
+            let step = Vector3::ith(axis, 1e-6);
+            let log = |delta: &Vector3<f64>| so3::log(&(so3::exp(delta) * so3::exp(&omega)));
+            let slope = (log(&step) - log(&-step)) / 2e-6;
+            assert!((slope - jacobian.column(axis)).norm() < 1e-7, "{length} {axis}");
+        }
+    }
+}

@@ -21,3 +21,18 @@ pub fn log(rotation: &UnitQuaternion<f64>) -> Vector3<f64> {
 pub fn angle_between(a: &UnitQuaternion<f64>, b: &UnitQuaternion<f64>) -> f64 {
     a.angle_to(b)
 }
+
+/// The `J` with `log(exp(δ) exp(omega)) = omega + J δ` to first order; `omega` shorter than 2π.
+pub fn left_jacobian_inverse(omega: &Vector3<f64>) -> Matrix3<f64> {
+    let squared = omega.norm_squared();
+    let angle = squared.sqrt();
+    // 1/θ² − (1 + cos θ) / (2 θ sin θ), by its series where that cancels.
+    let second = if angle < 1e-2 {
+        1.0 / 12.0 + squared / 720.0
+    } else {
+        let (sin, cos) = (0.5 * angle).sin_cos();
+        1.0 / squared - cos / (2.0 * angle * sin)
+    };
+    let cross = skew(omega);
+    Matrix3::identity() - 0.5 * cross + second * cross * cross
+}

@@ -95,6 +95,7 @@ pub(super) fn position_priors(
             pose: index.of(residual.image)?,
             center_in_world: positions[at].x_in_enu,
             sigma_m: widening * positions[at].sigma_m,
+            bias: None,
         })
     };
     report.residuals.iter().filter(|residual| residual.inlier).filter_map(prior).collect()

@@ -37,8 +37,8 @@ pub fn adjust(
     for round in 1..=options.rounds.max(1) {
         let mut problem = problem::camera_problem(cameras, input.fixed_intrinsics);
         if options.use_positions {
-            problem.position_priors = problem::priors_for(cameras, input, figures.mean_error_px());
-            report.num_positions = problem.position_priors.len() as u32;
+            problem.priors.positions = problem::priors_for(cameras, input, figures.mean_error_px());
+            report.num_positions = problem.priors.positions.len() as u32;
         }
         let index = PoseIndex::new(&cameras.images);
         let mut adapter = AdjustShards { inner: &mut *shards, index: &index };

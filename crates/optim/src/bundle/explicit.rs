@@ -7,9 +7,10 @@ use super::levenberg_marquardt::{Backend, Linearised};
 use super::linearisation::{Context, Linearisation};
 use super::pattern::Covisibility;
 use super::plan::{Dropped, ShardPlan};
-use super::reduced::{Reduced, prior_cost};
+use super::reduced::Reduced;
 use super::schur::{self, PoseRow};
 use super::step::{CameraStep, Tried, try_step};
+use super::terms;
 use super::{BundleError, BundleOptions, BundleProblem, BundleReport, BundleShard, Gauge, Shards};
 
 /// What the solve keeps of a shard.
@@ -69,7 +70,7 @@ impl Setup<'_> {
     }
 
     fn prior_cost(&self, cameras: &Cameras) -> f64 {
-        prior_cost(self.problem, &self.layout, cameras, self.options)
+        terms::cost(self.problem, &self.layout, cameras, self.options)
     }
 
     /// The plan of a shard that is not kept, and room for its linearisation.
@@ -97,7 +98,7 @@ impl<'a> Explicit<'a> {
         options: &'a BundleOptions,
         report: &mut BundleReport,
     ) -> Result<Self, BundleError> {
-        let cameras = Cameras::new(problem.poses.clone(), problem.intrinsics.clone());
+        let cameras = Cameras::of(problem);
         let num_poses = problem.poses.len();
         let mut covisibility = Covisibility::new(num_poses);
         let mut observed = vec![false; num_poses];
@@ -126,7 +127,8 @@ impl<'a> Explicit<'a> {
             states.push(ShardState { dropped, trial: points.clone(), points, kept: None });
         }
         let held_pair = held_pair(problem, &observed, fixed_points, options.gauge);
-        let layout = Layout::new(problem, &observed, held_pair.map(|(held, _)| held));
+        let held = held_pair.map(|(held, _)| held);
+        let layout = Layout::new(problem, &observed, held, options.behind_camera);
         for (state, plan) in states.iter_mut().zip(plans) {
             state.kept = plan.map(|plan| {
                 let linearisation = Linearisation::new(&plan, layout.stride);
@@ -135,7 +137,8 @@ impl<'a> Explicit<'a> {
         }
         report.unconstrained_poses = unconstrained(problem, &layout, held_pair);
         report.reduced_unknowns = layout.num_unknowns() as u64;
-        let (rows, pattern) = covisibility.rows(&layout);
+        let ties = terms::ties(&terms::terms(problem, &layout, &cameras, options));
+        let (rows, pattern) = covisibility.rows(&layout, &ties);
         let free = layout.poses.len();
         let intrinsics_offsets = (0..layout.intrinsics.len()).map(|v| pattern.offset(free + v)).collect();
         let reduced = Reduced::new(pattern, options)?;
@@ -145,7 +148,7 @@ impl<'a> Explicit<'a> {
 
     /// Whether any parameter may move and anything says where to.
     pub fn anything_to_adjust(&self, report: &BundleReport) -> bool {
-        let any = report.observations > 0 || !self.setup.problem.position_priors.is_empty();
+        let any = report.observations > 0 || self.setup.problem.has_measurements();
         any && (self.setup.layout.num_unknowns() > 0 || self.setup.free_points)
     }
 
@@ -233,7 +236,7 @@ fn held_pair(
     gauge: Gauge,
 ) -> Option<(u32, u32)> {
     let fixed: Vec<usize> = (0..observed.len()).filter(|i| problem.fixed_poses[*i] && observed[*i]).collect();
-    if gauge == Gauge::Damped || fixed_points || fixed.len() > 1 || problem.position_priors.len() >= 3 {
+    if gauge == Gauge::Damped || fixed_points || fixed.len() > 1 || problem.priors.fixes_the_datum() {
         return None;
     }
     let first = fixed.first().copied().or_else(|| observed.iter().position(|o| *o))?;

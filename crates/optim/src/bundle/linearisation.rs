@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use super::layout::{Cameras, Layout};
 use super::plan::{Planned, ShardPlan};
 use super::projection::project_with_jacobian;
+use super::terms::Term;
 use super::{BehindCamera, BundleProblem};
 use crate::Loss;
 
@@ -23,6 +24,24 @@ pub(super) struct Context<'a> {
     /// A pose and a direction in its frame along which it must not move.
     pub held_direction: Option<(u32, Vector3<f64>)>,
     pub damping: f64,
+}
+
+impl Context<'_> {
+    /// Takes what a term says of the held direction out of its Jacobian.
+    pub fn release_held_direction(&self, term: &mut Term) {
+        let Some((held, direction)) = &self.held_direction else { return };
+        let variable = self.layout.pose_variable[*held as usize];
+        for block in term.blocks.iter_mut().filter(|block| block.block == variable) {
+            let first = 3 - block.local;
+            for row in 0..3 {
+                let along: f64 =
+                    (0..3).map(|c| block.columns.get(first + c).map_or(0.0, |v| v[row]) * direction[c]).sum();
+                for (c, column) in block.columns.iter_mut().skip(first).enumerate() {
+                    column[row] -= along * direction[c];
+                }
+            }
+        }
+    }
 }
 
 /// Weighted residual and Jacobians of one observation; rows are x and y.

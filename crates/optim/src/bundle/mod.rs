@@ -16,6 +16,7 @@ mod linearisation;
 mod options;
 mod pattern;
 mod plan;
+mod priors;
 mod problem;
 mod projection;
 mod reduced;
@@ -24,9 +25,14 @@ mod schur;
 mod shards;
 mod solver;
 mod step;
+mod terms;
 
 pub use options::{BehindCamera, BundleOptions, BundleSolver, Gauge, Precision, Preconditioner};
-pub use problem::{BundleProblem, FocalPrior, PositionPrior, RefineIntrinsics};
+pub use priors::{
+    Anchor, DistancePrior, GravityPrior, Landmark, LandmarkPrior, Mark, ParameterPrior, PositionBias,
+    PositionPrior, Priors, RotationPrior,
+};
+pub use problem::{AdjustedCameras, BundleProblem, RefineIntrinsics};
 pub use report::{BundleReport, Termination};
 pub use shards::{BundleObservation, BundleShard, InMemoryShards, ShardError, Shards};
 pub use solver::solve;

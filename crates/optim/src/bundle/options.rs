@@ -16,7 +16,7 @@ pub enum Gauge {
     Damped,
     /// The first free pose is held, and of the pose farthest from it the motion of its centre along the line between
     /// both (to first order). Acts only where fewer than two poses are fixed, no points are fixed, and fewer than
-    /// three position priors exist.
+    /// three positions of cameras and landmarks are measured.
     TwoPoses,
 }
 

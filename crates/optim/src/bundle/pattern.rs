@@ -61,8 +61,9 @@ impl Covisibility {
         }
     }
 
-    /// The rows of the reduced system, one for each pose, and its pattern.
-    pub fn rows(&self, layout: &Layout) -> (Vec<PoseRow>, BlockPattern) {
+    /// The rows of the reduced system, one for each pose, and its pattern; `ties` are pairs of blocks that priors and marks
+    /// bring together.
+    pub fn rows(&self, layout: &Layout, ties: &[(u32, u32)]) -> (Vec<PoseRow>, BlockPattern) {
         let num_poses = layout.pose_variable.len();
         let rows: Vec<PoseRow> = (0..num_poses)
             .map(|pose| {
@@ -71,7 +72,9 @@ impl Covisibility {
             })
             .collect();
         let free = layout.poses.len();
-        let mut above = vec![Vec::new(); free + layout.intrinsics.len()];
+        let dims = layout.dims();
+        let mut above = vec![Vec::new(); dims.len()];
+        ties.iter().for_each(|(row, column)| above[*column as usize].push(*row));
         for (pose, row) in rows.iter().enumerate() {
             let variable = layout.pose_variable[pose];
             if variable != NONE {
@@ -87,7 +90,7 @@ impl Covisibility {
                 }
             }
         }
-        let pattern = BlockPattern::new(&layout.dims(), above);
+        let pattern = BlockPattern::new(&dims, above);
         (rows, pattern)
     }
 

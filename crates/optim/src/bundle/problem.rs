@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use terrane_geometry::{Camera, Rigid3};
 
 use super::BundleError;
+use super::priors::{self, Landmark, Mark, PositionBias, Priors};
 
 /// The camera side of a bundle adjustment. Points and observations come in shards ([`super::Shards`]).
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -19,10 +20,18 @@ pub struct BundleProblem {
     pub intrinsics_of_pose: Vec<u32>,
     /// For each of the intrinsics, which of its parameters to refine.
     pub refine: Vec<RefineIntrinsics>,
-    /// Known positions of camera centres, as from GPS.
-    pub position_priors: Vec<PositionPrior>,
-    /// Known focal lengths, as from EXIF.
-    pub focal_priors: Vec<FocalPrior>,
+    /// Points that are kept beside the cameras, as ground control points; most problems have none.
+    #[serde(default)]
+    pub landmarks: Vec<Landmark>,
+    /// Where photographs show landmarks.
+    #[serde(default)]
+    pub marks: Vec<Mark>,
+    /// What measured positions have in common, as those of one flight.
+    #[serde(default)]
+    pub position_biases: Vec<PositionBias>,
+    /// What is known beside observations.
+    #[serde(default)]
+    pub priors: Priors,
 }
 
 /// Which parameters of a camera to refine.
@@ -61,28 +70,6 @@ impl RefineIntrinsics {
     }
 }
 
-/// A measured camera centre.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct PositionPrior {
-    /// Index of the pose.
-    pub pose: u32,
-    /// The measured centre, in the world's frame and unit.
-    pub center_in_world: Vector3<f64>,
-    /// Standard deviation along each axis of the world; positive.
-    pub sigma_m: Vector3<f64>,
-}
-
-/// A focal length known beforehand; applies to each focal parameter of the intrinsics when focal length is refined.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct FocalPrior {
-    /// Index of the intrinsics.
-    pub intrinsics: u32,
-    /// The expected focal length in pixels.
-    pub focal_px: f64,
-    /// Its standard deviation in pixels; positive.
-    pub sigma_px: f64,
-}
-
 impl BundleProblem {
     /// A problem with every pose free and the same refinement for all intrinsics.
     pub fn new(
@@ -97,8 +84,10 @@ impl BundleProblem {
             poses,
             intrinsics,
             intrinsics_of_pose,
-            position_priors: Vec::new(),
-            focal_priors: Vec::new(),
+            landmarks: Vec::new(),
+            marks: Vec::new(),
+            position_biases: Vec::new(),
+            priors: Priors::default(),
         }
     }
 
@@ -125,7 +114,12 @@ impl BundleProblem {
             return Err(BundleError::invalid("more than 2^32 poses or intrinsics".to_owned()));
         }
         self.validate_values()?;
-        self.validate_priors()
+        priors::validate(self)
+    }
+
+    /// Whether anything beside observations says where cameras are.
+    pub(super) fn has_measurements(&self) -> bool {
+        !self.priors.positions.is_empty() || !self.marks.is_empty()
     }
 
     fn validate_values(&self) -> Result<(), BundleError> {
@@ -152,40 +146,36 @@ impl BundleProblem {
         }
         Ok(())
     }
-
-    fn validate_priors(&self) -> Result<(), BundleError> {
-        for (i, prior) in self.position_priors.iter().enumerate() {
-            if prior.pose as usize >= self.poses.len() {
-                return Err(BundleError::invalid(format!(
-                    "position prior {i} names pose {} of none",
-                    prior.pose
-                )));
-            }
-            let finite = prior.center_in_world.iter().all(|v| v.is_finite());
-            if !finite || !prior.sigma_m.iter().all(|v| v.is_finite() && *v > 0.0) {
-                return Err(BundleError::invalid(format!(
-                    "position prior {i} must be finite with positive standard deviations"
-                )));
-            }
-        }
-        for (i, prior) in self.focal_priors.iter().enumerate() {
-            if prior.intrinsics as usize >= self.intrinsics.len() {
-                return Err(BundleError::invalid(format!(
-                    "focal prior {i} names intrinsics {} of none",
-                    prior.intrinsics
-                )));
-            }
-            if !prior.focal_px.is_finite() || !prior.sigma_px.is_finite() || prior.sigma_px <= 0.0 {
-                return Err(BundleError::invalid(format!(
-                    "focal prior {i} must be finite with a positive standard deviation"
-                )));
-            }
-        }
-        Ok(())
-    }
 }
 
 /// Whether the focal lengths are positive and every parameter is finite.
 pub(super) fn camera_is_sane(camera: &Camera) -> bool {
     camera.params().iter().all(|v| v.is_finite()) && camera.focal_px().iter().all(|f| *f > 0.0)
+}
+
+/// What an adjustment of a problem found on the camera side.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AdjustedCameras {
+    /// `cam_from_world` of each pose.
+    pub poses: Vec<Rigid3>,
+    /// The intrinsics.
+    pub intrinsics: Vec<Camera>,
+    /// Each position bias.
+    pub biases_m: Vec<Vector3<f64>>,
+    /// Each landmark in the world.
+    pub landmarks: Vec<Vector3<f64>>,
+}
+
+impl AdjustedCameras {
+    /// Takes them over into the problem.
+    pub fn put_into(self, problem: &mut BundleProblem) {
+        problem.poses = self.poses;
+        problem.intrinsics = self.intrinsics;
+        for (bias, found) in problem.position_biases.iter_mut().zip(self.biases_m) {
+            bias.bias_m = found;
+        }
+        for (landmark, found) in problem.landmarks.iter_mut().zip(self.landmarks) {
+            landmark.x_in_world = found;
+        }
+    }
 }

@@ -1,11 +1,12 @@
 //! Putting the rows, the priors and the damping together, and solving for the cameras' step.
 
-use nalgebra::Vector3;
+use smallvec::SmallVec;
 
-use super::layout::{Cameras, Layout, NONE};
+use super::layout::{Layout, NONE};
 use super::linearisation::Context;
 use super::schur::PoseRow;
-use super::{BundleError, BundleOptions, BundleProblem};
+use super::terms::{Term, TermBlock, dot, terms};
+use super::{BundleError, BundleOptions};
 use crate::linear::{BlockPattern, BlockSystem};
 
 /// The reduced camera system at one point of the search.
@@ -35,8 +36,10 @@ impl Reduced {
         for (pose, row) in rows.iter().enumerate() {
             self.add_row(context.layout, pose, row);
         }
-        self.add_position_priors(context, options);
-        self.add_focal_priors(context);
+        for mut term in terms(context.problem, context.layout, context.cameras, options) {
+            context.release_held_direction(&mut term);
+            self.add_term(context, &term);
+        }
         self.hold_direction(context);
         let dims: Vec<usize> = context.layout.dims();
         let mut at = 0;
@@ -89,67 +92,34 @@ impl Reduced {
         }
     }
 
-    /// Adds `weight · j jᵀ` and the gradient of a residual to a block, for a row `j` of its Jacobian.
-    fn add_prior(&mut self, block: usize, jacobian: &[f64], residual: f64, weight: f64) {
-        let offset = self.system.pattern().offset(block);
-        let n = jacobian.len();
-        let mut outer = [0.0; 36];
-        for c in 0..n {
-            for a in 0..n {
-                outer[n * c + a] = weight * jacobian[a] * jacobian[c];
+    /// Adds what a prior or mark says: products of its Jacobians to the blocks, its gradient.
+    fn add_term(&mut self, context: &Context<'_>, term: &Term) {
+        let layout = context.layout;
+        for a in &term.blocks {
+            let first = layout.offsets[a.block as usize] + a.local;
+            for (i, column) in a.columns.iter().enumerate() {
+                let descent = term.weight * dot(column, &term.residual);
+                self.descent[first + i] -= descent;
+                self.reduced_descent[first + i] -= descent;
+                self.diagonal[first + i] += term.weight * dot(column, column);
             }
-            let descent = weight * jacobian[c] * residual;
-            self.descent[offset + c] -= descent;
-            self.reduced_descent[offset + c] -= descent;
-            self.diagonal[offset + c] += outer[n * c + c];
-        }
-        self.system.add(block, block, &outer[..n * n], n);
-    }
-
-    fn add_position_priors(&mut self, context: &Context<'_>, options: &BundleOptions) {
-        for prior in &context.problem.position_priors {
-            let variable = context.layout.pose_variable[prior.pose as usize];
-            if variable == NONE {
-                continue;
-            }
-            let center = context.cameras.poses[prior.pose as usize].center();
-            let residual = (center - prior.center_in_world).component_div(&prior.sigma_m);
-            let (_, weight) =
-                options.prior_loss.evaluate(residual.norm_squared(), options.prior_loss_scale_sigma);
-            for axis in 0..3 {
-                // With (ω, v) on the left of cam_from_world the centre moves by −Rᵀ v.
-                let rotation = &context.cameras.rotations[prior.pose as usize];
-                let mut along = Vector3::from_fn(|c, _| -rotation[c][axis] / prior.sigma_m[axis]);
-                if let Some((held, direction)) = &context.held_direction
-                    && *held == prior.pose
-                {
-                    along -= direction * along.dot(direction);
-                }
-                let jacobian = [0.0, 0.0, 0.0, along.x, along.y, along.z];
-                self.add_prior(variable as usize, &jacobian, residual[axis], weight);
+            for b in term.blocks.iter().filter(|b| a.block <= b.block) {
+                self.add_product(term.weight, a, b);
             }
         }
     }
 
-    fn add_focal_priors(&mut self, context: &Context<'_>) {
-        for prior in &context.problem.focal_priors {
-            let variable = context.layout.intrinsics_variable[prior.intrinsics as usize];
-            if variable == NONE {
-                continue;
-            }
-            let camera = &context.cameras.intrinsics[prior.intrinsics as usize];
-            let block = context.layout.poses.len() + variable as usize;
-            let refined = &context.layout.params[variable as usize];
-            for (a, &param) in refined.iter().enumerate().filter(|(_, p)| **p < camera.model.num_focal()) {
-                let residual = (camera.params()[param] - prior.focal_px) / prior.sigma_px;
-                let weight = 1.0 / (prior.sigma_px * prior.sigma_px);
-                let offset = self.system.pattern().offset(block) + a;
-                self.system.add_to_diagonal(block, a, weight);
-                self.diagonal[offset] += weight;
-                self.descent[offset] -= residual / prior.sigma_px;
-                self.reduced_descent[offset] -= residual / prior.sigma_px;
+    /// Adds `weight · JₐᵀJ_b` to the block of `a` and `b`, in this order.
+    fn add_product(&mut self, weight: f64, a: &TermBlock, b: &TermBlock) {
+        let pattern = self.system.pattern();
+        let (rows, columns) = (pattern.dim(a.block as usize), pattern.dim(b.block as usize));
+        let mut product = SmallVec::<[f64; 36]>::from_elem(0.0, rows * columns);
+        for (j, right) in b.columns.iter().enumerate() {
+            for (i, left) in a.columns.iter().enumerate() {
+                product[rows * (b.local + j) + a.local + i] = weight * dot(left, right);
             }
         }
+        self.system.add(a.block as usize, b.block as usize, &product, rows);
     }
 
     /// Gives the held direction a stiffness of its own, so that the step along it is zero.
@@ -161,8 +131,12 @@ impl Reduced {
         }
         let offset = 6 * variable as usize;
         let stiffness = self.diagonal[offset + 3..offset + 6].iter().sum::<f64>().max(1.0);
-        let jacobian = [0.0, 0.0, 0.0, n.x, n.y, n.z];
-        self.add_prior(variable as usize, &jacobian, 0.0, stiffness);
+        let columns = n.iter().map(|along| [*along, 0.0, 0.0]).collect();
+        let block = TermBlock { block: variable, local: 3, columns };
+        for (i, column) in block.columns.iter().enumerate() {
+            self.diagonal[offset + 3 + i] += stiffness * column[0] * column[0];
+        }
+        self.add_product(stiffness, &block, &block);
     }
 
     /// The step of the cameras, or `None` when the system is not positive definite.
@@ -185,28 +159,4 @@ impl Reduced {
         let terms = step.iter().zip(&self.descent).zip(&self.diagonal);
         terms.map(|((h, descent), d)| 0.5 * h * (damping * d * h + descent)).sum()
     }
-}
-
-/// The cost of all priors.
-pub(super) fn prior_cost(
-    problem: &BundleProblem,
-    layout: &Layout,
-    cameras: &Cameras,
-    options: &BundleOptions,
-) -> f64 {
-    let positions = problem.position_priors.iter().map(|prior| {
-        let center = cameras.poses[prior.pose as usize].center();
-        let residual = (center - prior.center_in_world).component_div(&prior.sigma_m);
-        0.5 * options.prior_loss.evaluate(residual.norm_squared(), options.prior_loss_scale_sigma).0
-    });
-    let focals = problem.focal_priors.iter().map(|prior| {
-        let variable = layout.intrinsics_variable[prior.intrinsics as usize];
-        if variable == NONE {
-            return 0.0;
-        }
-        let camera = &cameras.intrinsics[prior.intrinsics as usize];
-        let refined = layout.params[variable as usize].iter().filter(|p| **p < camera.model.num_focal());
-        refined.map(|p| 0.5 * ((camera.params()[*p] - prior.focal_px) / prior.sigma_px).powi(2)).sum()
-    });
-    positions.sum::<f64>() + focals.sum::<f64>()
 }

@@ -6,7 +6,9 @@ use super::explicit::Explicit;
 use super::implicit::solve_here;
 use super::layout::Cameras;
 use super::levenberg_marquardt::minimise;
-use super::{BundleError, BundleOptions, BundleProblem, BundleReport, BundleSolver, Gauge, Shards};
+use super::{
+    AdjustedCameras, BundleError, BundleOptions, BundleProblem, BundleReport, BundleSolver, Gauge, Shards,
+};
 
 /// Up to this many camera unknowns the system is factorised. With 441 (problem-49 of BAL) that is the faster way by a
 /// quarter, with 3,600 (an aerial block of 400 photographs) conjugate gradients are six times as fast.
@@ -38,8 +40,7 @@ pub fn solve(
     for (i, points) in points.iter().enumerate() {
         shards.store_points(i, points)?;
     }
-    problem.poses = cameras.poses;
-    problem.intrinsics = cameras.intrinsics;
+    AdjustedCameras::from(cameras).put_into(problem);
     Ok(report)
 }
 

@@ -69,13 +69,13 @@ impl Stored {
         whole: &mut WholeProblem,
     ) -> Result<BundleReport, BundleError> {
         let Self { side, poses, mut report, origins, .. } = self;
-        let (poses, intrinsics) = solve_parts(side, host, poses, &mut report)?;
+        let cameras = solve_parts(side, host, poses, &mut report)?;
         for (origins, answer) in origins.iter().zip(host.ask(&PartRequest::Points)?) {
             for ((shard, point), x) in origins.iter().zip(answer.as_chunks::<3>().0) {
                 whole.shards.0[*shard as usize].points[*point as usize] = Vector3::from(*x);
             }
         }
-        (whole.problem.poses, whole.problem.intrinsics) = (poses, intrinsics);
+        cameras.put_into(&mut whole.problem);
         Ok(report)
     }
 }

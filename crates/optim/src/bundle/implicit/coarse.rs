@@ -42,10 +42,10 @@ pub(super) fn pose_columns(cameras: &Cameras, pose: usize, middle: &Vector3<f64>
     columns
 }
 
-/// The coarse unknowns come in groups: the clusters, then the shared intrinsics.
+/// The coarse unknowns come in groups: the clusters, then the blocks that no single pose owns.
 pub(super) struct CoarseGroups {
     pub num_clusters: usize,
-    /// First camera unknown and number of each of the shared intrinsics.
+    /// First camera unknown and number of each of these blocks.
     pub shared: Vec<(u32, u32)>,
 }
 
@@ -54,6 +54,12 @@ impl CoarseGroups {
     pub fn dims(&self) -> Vec<usize> {
         let shared = self.shared.iter().map(|(_, n)| *n as usize);
         std::iter::repeat_n(SIMILARITY, self.num_clusters).chain(shared).collect()
+    }
+
+    /// Size of a group.
+    pub fn dim(&self, group: u32) -> usize {
+        let shared = (group as usize).checked_sub(self.num_clusters);
+        shared.map_or(SIMILARITY, |at| self.shared[at].1 as usize)
     }
 
     /// The group of a pose's shared intrinsics.

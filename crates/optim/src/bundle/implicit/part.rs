@@ -72,6 +72,17 @@ pub(super) struct CameraUnknowns {
     pub own: bool,
 }
 
+/// Whose a block of unknowns is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum BlockOwner {
+    /// The pose's.
+    Pose(u32),
+    /// The intrinsics of that pose alone.
+    OwnIntrinsics(u32),
+    /// No single pose's: the number in [`CameraMap::shared`].
+    Nobody(u32),
+}
+
 /// The unknowns of every pose.
 pub(super) struct CameraMap {
     pub of_pose: Vec<CameraUnknowns>,
@@ -79,21 +90,19 @@ pub(super) struct CameraMap {
     pub stride: usize,
     /// All unknowns.
     pub num_unknowns: usize,
-    /// First unknown and number of each of the intrinsics that poses share.
+    /// First unknown and number of each of the blocks that no single pose owns, ascending: intrinsics that poses share,
+    /// position biases, landmarks.
     pub shared: Vec<(u32, u32)>,
+    /// For each block of the layout, whose it is.
+    pub owners: Vec<BlockOwner>,
 }
 
 impl CameraMap {
-    pub fn new(problem: &BundleProblem, layout: &Layout, observed: &[bool]) -> Self {
-        let mut offsets = Vec::with_capacity(layout.intrinsics.len());
-        let mut at = 6 * layout.poses.len();
-        for params in &layout.params {
-            offsets.push(at as u32);
-            at += params.len();
-        }
+    pub fn new(problem: &BundleProblem, layout: &Layout) -> Self {
+        let free = layout.poses.len();
         let mut uses = vec![0u32; layout.intrinsics.len()];
         for (pose, variable) in layout.intrinsics_variable_of_pose.iter().enumerate() {
-            if *variable != NONE && observed[pose] {
+            if *variable != NONE && layout.seen[pose] {
                 uses[*variable as usize] += 1;
             }
         }
@@ -103,21 +112,31 @@ impl CameraMap {
             let refined = intrinsics != NONE;
             CameraUnknowns {
                 pose: if variable == NONE { NONE } else { 6 * variable },
-                intrinsics: if refined { offsets[intrinsics as usize] } else { NONE },
+                intrinsics: if refined { layout.offsets[free + intrinsics as usize] as u32 } else { NONE },
                 num_intrinsics: if refined { layout.params[intrinsics as usize].len() as u32 } else { 0 },
-                own: refined && variable != NONE && uses[intrinsics as usize] == 1,
+                own: refined && variable != NONE && layout.seen[pose] && uses[intrinsics as usize] == 1,
             }
         });
         let of_pose: Vec<CameraUnknowns> = of_pose.collect();
-        let mut own = vec![false; layout.intrinsics.len()];
+        let mut owners = vec![BlockOwner::Nobody(0); layout.offsets.len() - 1];
         for (pose, unknowns) in of_pose.iter().enumerate() {
-            if unknowns.own && observed[pose] {
-                own[layout.intrinsics_variable_of_pose[pose] as usize] = true;
+            if unknowns.pose != NONE {
+                owners[layout.pose_variable[pose] as usize] = BlockOwner::Pose(pose as u32);
+            }
+            if unknowns.own {
+                let variable = layout.intrinsics_variable_of_pose[pose] as usize;
+                owners[free + variable] = BlockOwner::OwnIntrinsics(pose as u32);
             }
         }
-        let shared = (0..layout.intrinsics.len()).filter(|v| !own[*v]);
-        let shared = shared.map(|v| (offsets[v], layout.params[v].len() as u32)).collect();
-        Self { of_pose, stride: layout.stride, num_unknowns: at, shared }
+        let mut shared = Vec::new();
+        for (block, owner) in owners.iter_mut().enumerate() {
+            if let BlockOwner::Nobody(at) = owner {
+                *at = shared.len() as u32;
+                let (first, end) = (layout.offsets[block] as u32, layout.offsets[block + 1] as u32);
+                shared.push((first, end - first));
+            }
+        }
+        Self { of_pose, stride: layout.stride, num_unknowns: layout.num_unknowns(), shared, owners }
     }
 
     /// Width of the unknowns of one camera in local vectors.

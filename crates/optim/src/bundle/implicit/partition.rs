@@ -32,7 +32,7 @@ pub fn partition(
 ) -> Result<Partition, BundleError> {
     problem.validate()?;
     options.validate()?;
-    let cameras = Cameras::new(problem.poses.clone(), problem.intrinsics.clone());
+    let cameras = Cameras::of(problem);
     let num_poses = problem.poses.len();
     let mut report = BundleReport::empty();
     let mut views = Views::new(num_poses);

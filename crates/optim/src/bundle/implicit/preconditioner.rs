@@ -1,10 +1,13 @@
 //! What is near the inverse of the reduced camera system.
 
 use nalgebra::{SMatrix, SVector};
+use smallvec::SmallVec;
 
 use super::super::layout::{Cameras, NONE};
+use super::super::terms::{Term, dot};
 use super::super::{BundleError, Preconditioner};
 use super::coarse::{PoseColumns, SIMILARITY, middles, pose_columns};
+use super::known;
 use super::state::packed;
 use super::system::CameraSystem;
 use super::worker::{CameraSide, PartRequest};
@@ -88,14 +91,16 @@ pub(super) struct Coarse {
 
 impl Coarse {
     /// Analyses which groups touch.
-    pub fn new(side: &CameraSide, touched: Vec<Vec<u32>>) -> Result<Self, BundleError> {
+    pub fn new(side: &CameraSide, touched: Vec<Vec<u32>>, terms: &[Term]) -> Result<Self, BundleError> {
         let dims = side.coarse.dims();
         let mut above = vec![Vec::new(); dims.len()];
-        for groups in &touched {
+        let mut bring_together = |groups: &[u32]| {
             for (at, column) in groups.iter().enumerate() {
                 above[*column as usize].extend_from_slice(&groups[..at]);
             }
-        }
+        };
+        touched.iter().for_each(|groups| bring_together(groups));
+        terms.iter().for_each(|term| bring_together(&known::groups(side, term)));
         // A pose without observations still ties its cluster to its intrinsics: both lie on the diagonal.
         let system = BlockSystem::new(BlockPattern::new(&dims, above), LinearSolver::Simplicial)?;
         Ok(Self { system, touched, columns: Vec::new(), holds: false })
@@ -109,8 +114,14 @@ impl Coarse {
             .map(move |groups| groups.iter().map(|group| dims[*group as usize]).sum::<usize>().pow(2))
     }
 
-    /// Adds the parts' matrices, and what damping and priors put on the diagonal blocks of cameras.
-    pub fn assemble(&mut self, side: &CameraSide, cameras: &Cameras, parts: &[Vec<f64>], extra: &Extra<'_>) {
+    /// Adds the parts' matrices, and what damping, priors and marks add on the camera side.
+    pub fn assemble(
+        &mut self,
+        side: &CameraSide,
+        cameras: &Cameras,
+        parts: &[Vec<f64>],
+        (damping, terms): (&[f64], &[Term]),
+    ) {
         self.system.clear();
         let dims = side.coarse.dims();
         for (groups, matrix) in self.touched.iter().zip(parts) {
@@ -122,22 +133,18 @@ impl Coarse {
             .collect();
         for (pose, unknowns) in side.map.of_pose.iter().enumerate().filter(|(_, u)| u.pose != NONE) {
             let p = &self.columns[pose];
-            let damping = SVector::<f64, 6>::from_fn(|i, _| extra.damping[unknowns.pose as usize + i]);
-            let mut block: SMatrix<f64, SIMILARITY, SIMILARITY> =
+            let damping = SVector::<f64, 6>::from_fn(|i, _| damping[unknowns.pose as usize + i]);
+            let block: SMatrix<f64, SIMILARITY, SIMILARITY> =
                 p.transpose() * SMatrix::from_diagonal(&damping) * p;
-            for prior in &extra.pose_priors[pose] {
-                let row = p.transpose() * prior.jacobian;
-                block += row * row.transpose() * prior.weight;
-            }
             let cluster = side.clusters.of_pose[pose] as usize;
             self.system.add(cluster, cluster, block.as_slice(), SIMILARITY);
         }
         for (at, (first, n)) in side.coarse.shared.iter().enumerate() {
             for a in 0..*n as usize {
-                let value = extra.damping[*first as usize + a] + extra.shared_priors[*first as usize + a];
-                self.system.add_to_diagonal(side.coarse.num_clusters + at, a, value);
+                self.system.add_to_diagonal(side.coarse.num_clusters + at, a, damping[*first as usize + a]);
             }
         }
+        terms.iter().for_each(|term| self.add_term(side, term));
         // A cluster of held cameras has no columns: its unknowns stay zero.
         for (group, dim) in dims.iter().enumerate() {
             for component in 0..*dim {
@@ -147,6 +154,20 @@ impl Coarse {
             }
         }
         self.holds = self.system.factorize();
+    }
+
+    fn add_term(&mut self, side: &CameraSide, term: &Term) {
+        let coarse = known::coarse(side, &self.columns, term);
+        for (at, column) in coarse.iter().enumerate() {
+            for row in &coarse[..=at] {
+                let products = column
+                    .columns
+                    .iter()
+                    .flat_map(|right| row.columns.iter().map(move |left| term.weight * dot(left, right)));
+                let block: SmallVec<[f64; 64]> = products.collect();
+                self.system.add(row.group as usize, column.group as usize, &block, row.columns.len());
+            }
+        }
     }
 
     /// Adds `P (Pᵀ S P)⁻¹ Pᵀ r` to `z`.
@@ -179,21 +200,6 @@ impl Coarse {
             (0..*n as usize).for_each(|a| z[*first as usize + a] += right[offset + a]);
         }
     }
-}
-
-/// What the camera side itself puts on the diagonal.
-pub(super) struct Extra<'a> {
-    /// Of each unknown.
-    pub damping: &'a [f64],
-    pub pose_priors: &'a [Vec<PosePrior>],
-    /// Weights of the priors of shared intrinsics, of each unknown.
-    pub shared_priors: &'a [f64],
-}
-
-/// A weighted row of a pose's unknowns.
-pub(super) struct PosePrior {
-    pub jacobian: SVector<f64, 6>,
-    pub weight: f64,
 }
 
 /// Adds the dense lower triangle of a part.

@@ -2,28 +2,28 @@
 
 use std::sync::Arc;
 
-use nalgebra::{SVector, Vector3};
-use terrane_geometry::{Camera, Rigid3};
+use nalgebra::Vector3;
 
 use super::super::layout::{Cameras, NONE};
 use super::super::levenberg_marquardt::{Backend, Linearised, minimise};
-use super::super::reduced::prior_cost;
 use super::super::step::Tried;
+use super::super::terms::{self, Term, terms};
 use super::super::{
-    BundleError, BundleOptions, BundleProblem, BundleReport, BundleSolver, Preconditioner, Shards,
+    AdjustedCameras, BundleError, BundleOptions, BundleProblem, BundleReport, BundleSolver, Preconditioner,
+    Shards,
 };
 use super::conjugate_gradients;
 use super::host::{LocalHost, PartHost};
+use super::known;
 use super::local::cluster_indices;
 use super::partition::{Partition, partition};
-use super::preconditioner::{BlockFactors, Coarse, Extra, Inverse, PosePrior};
-use super::priors::{PriorRow, prior_rows};
+use super::preconditioner::{BlockFactors, Coarse, Inverse};
 use super::state::packed;
 use super::system::{CameraSystem, Preconditioned};
 use super::worker::{CameraSide, PartRequest, PartWorker};
 
 /// Solves a problem that was cut by [`super::partition`], whoever holds the parts; `poses` are those of each part. Begins
-/// with the report of the partition. The adjusted poses and intrinsics come back; points stay with the holders.
+/// with the report of the partition. The adjusted cameras come back; points stay with the holders.
 ///
 /// # Errors
 /// When the options do not fit the problem, or a part can't be reached.
@@ -32,14 +32,14 @@ pub fn solve_parts(
     host: &mut dyn PartHost,
     poses: Vec<Vec<u32>>,
     report: &mut BundleReport,
-) -> Result<(Vec<Rigid3>, Vec<Camera>), BundleError> {
-    let any = report.observations > 0 || !side.problem.position_priors.is_empty();
+) -> Result<AdjustedCameras, BundleError> {
+    let any = report.observations > 0 || side.problem.has_measurements();
     let anything = any && (side.map.num_unknowns > 0 || report.points > 0);
     let mut driver = Driver::new(side.clone(), host, poses)?;
     report.solver = BundleSolver::Implicit;
     report.termination = minimise(&mut driver, &side.options, anything, report)?;
     report.linear_iterations = driver.linear_iterations;
-    Ok((driver.cameras.poses, driver.cameras.intrinsics))
+    Ok(driver.cameras.into())
 }
 
 /// Solves a problem with all parts in this process; the adjusted cameras, and the points of each shard.
@@ -58,7 +58,7 @@ pub(in super::super) fn solve_here(
         worker.take(index as u32, part)?;
     }
     let mut host = LocalHost(worker);
-    let (poses, intrinsics) = solve_parts(side, &mut host, poses, report)?;
+    let cameras = solve_parts(side, &mut host, poses, report)?;
     let mut points = Vec::with_capacity(shards.len());
     for index in 0..shards.len() {
         points.push(shards.load(index)?.points.clone());
@@ -68,7 +68,7 @@ pub(in super::super) fn solve_here(
             points[*shard as usize][*point as usize] = Vector3::from(*x);
         }
     }
-    Ok((Cameras::new(poses, intrinsics), points))
+    Ok((cameras.into(), points))
 }
 
 /// The camera side, whoever holds the parts.
@@ -99,9 +99,9 @@ struct Sums {
     normal: Vec<f64>,
     /// Packed diagonal blocks of the reduced system, with priors.
     reduced: Vec<f64>,
-    /// Packed blocks of the intrinsics that poses share.
+    /// Packed blocks that no single pose owns.
     shared: Vec<Vec<f64>>,
-    priors: Vec<PriorRow>,
+    terms: Vec<Term>,
     steepest: f64,
 }
 
@@ -115,18 +115,21 @@ impl<'a> Driver<'a> {
             Preconditioner::Auto => Preconditioner::TwoLevel,
             kind => kind,
         };
-        if kind == Preconditioner::PowerSeries && !side.map.shared.is_empty() {
+        let apart = side.map.shared.is_empty() && side.problem.priors.distances.is_empty();
+        if kind == Preconditioner::PowerSeries && !apart {
             return Err(BundleError::invalid(
-                "the power series needs intrinsics that no two poses share: hold them, or choose two-level"
+                "the power series needs intrinsics that no two poses share, and neither landmarks, biases nor distances: \
+                 hold them, or choose two-level"
                     .to_owned(),
             ));
         }
-        let cameras = Cameras::new(side.problem.poses.clone(), side.problem.intrinsics.clone());
+        let cameras = Cameras::of(&side.problem);
+        let terms = terms(&side.problem, &side.layout, &cameras, &side.options);
         let frame = side.frame(&cameras);
         let coarse = match kind {
             Preconditioner::TwoLevel => {
                 let touched = poses.iter().map(|poses| side.coarse.of_poses(&frame, poses)).collect();
-                Some(Coarse::new(&side, touched)?)
+                Some(Coarse::new(&side, touched, &terms)?)
             }
             _ => None,
         };
@@ -189,26 +192,21 @@ impl<'a> Driver<'a> {
         cost
     }
 
-    fn add_priors(&mut self) {
-        let width = self.side.map.width();
+    /// Adds what priors and marks say; their cost.
+    fn add_terms(&mut self) -> f64 {
+        let side = self.side.as_ref();
         let sums = &mut self.sums;
-        sums.priors = prior_rows(&self.side, &self.cameras, &self.side.options);
-        for row in &sums.priors {
-            for (a, ja) in row.jacobian.iter().enumerate() {
-                let slope = row.weight * ja * row.residual;
-                sums.descent[row.first + a] -= slope;
-                sums.reduced_descent[row.first + a] -= slope;
-                sums.diagonal[row.first + a] += row.weight * ja * ja;
-                let Some(pose) = row.pose else { continue };
-                for (b, jb) in row.jacobian[..=a].iter().enumerate() {
-                    let at = packed(width) * pose as usize + packed(row.local + a) + row.local + b;
-                    sums.reduced[at] += row.weight * ja * jb;
-                    if let Some(normal) = sums.normal.get_mut(at) {
-                        *normal += row.weight * ja * jb;
-                    }
-                }
-            }
+        sums.terms = terms(&side.problem, &side.layout, &self.cameras, &side.options);
+        known::for_each_unknown(side, &sums.terms, |unknown, slope, diagonal| {
+            sums.descent[unknown] -= slope;
+            sums.reduced_descent[unknown] -= slope;
+            sums.diagonal[unknown] += diagonal;
+        });
+        known::add_to_pose_blocks(side, &sums.terms, &mut sums.reduced);
+        if !sums.normal.is_empty() {
+            known::add_to_pose_blocks(side, &sums.terms, &mut sums.normal);
         }
+        sums.terms.iter().map(|term| term.cost).sum()
     }
 
     /// Builds the preconditioner for the damping at hand.
@@ -228,7 +226,7 @@ impl<'a> Driver<'a> {
                 block[packed(6 + a) + 6 + a] += sums.damping[unknowns.intrinsics as usize + a];
             }
         }
-        sums.shared = shared_blocks(&side, from, &sums.damping, &sums.priors);
+        sums.shared = shared_blocks(&side, from, &sums.damping, &sums.terms);
         let by_cluster = !self.inverse.cluster_indices.is_empty();
         self.inverse.factors = BlockFactors::new(&side, &blocks, &sums.shared, !by_cluster);
         if !by_cluster {
@@ -237,11 +235,8 @@ impl<'a> Driver<'a> {
         let coarse = self.inverse.coarse.is_some();
         let answers = self.host.ask(&PartRequest::Prepare { diagonal: blocks, coarse })?;
         if let Some(coarse) = &mut self.inverse.coarse {
-            let (pose_priors, shared_priors) = coarse_priors(&side, &sums.priors);
-            let extra =
-                Extra { damping: &sums.damping, pose_priors: &pose_priors, shared_priors: &shared_priors };
             check_lengths(&answers, coarse.part_lengths(&side))?;
-            coarse.assemble(&side, &self.cameras, &answers, &extra);
+            coarse.assemble(&side, &self.cameras, &answers, (&sums.damping, &sums.terms));
         }
         Ok(())
     }
@@ -254,9 +249,7 @@ impl Backend for Driver<'_> {
         let (width, of) = (self.side.map.width(), |poses: &Vec<u32>| poses.len());
         let lengths = self.poses.iter().map(of).map(|n| 2 + n * (3 * width + blocks * packed(width)));
         check_lengths(&answers, lengths)?;
-        let mut cost = self.gather(&answers);
-        self.add_priors();
-        cost += prior_cost(&self.side.problem, &self.side.layout, &self.cameras, &self.side.options);
+        let cost = self.gather(&answers) + self.add_terms();
         let tiny = f64::MIN_POSITIVE.sqrt();
         for d in &mut self.sums.diagonal {
             // A parameter without any effect stays where it is.
@@ -277,7 +270,7 @@ impl Backend for Driver<'_> {
                 host: &mut **host,
                 poses,
                 damping: &sums.damping,
-                priors: &sums.priors,
+                terms: &sums.terms,
             };
             let options = &side.options;
             let mut system = Preconditioned { system, inverse };
@@ -298,7 +291,7 @@ impl Backend for Driver<'_> {
             })
             .sum();
         let mut sum = Tried {
-            cost: prior_cost(&side.problem, &side.layout, &next, &side.options),
+            cost: terms::cost(&side.problem, &side.layout, &next, &side.options),
             model_reduction: model,
             step_squared: step.iter().map(|h| h * h).sum(),
             norm_squared: self.cameras.squared_norm(&side.layout),
@@ -335,8 +328,8 @@ fn check_lengths(answers: &[Vec<f64>], lengths: impl Iterator<Item = usize>) -> 
     }
 }
 
-/// The blocks of the intrinsics that poses share: sums over the poses, damped once.
-fn shared_blocks(side: &CameraSide, blocks: &[f64], damping: &[f64], priors: &[PriorRow]) -> Vec<Vec<f64>> {
+/// The blocks that no single pose owns: sums over the poses and terms, damped once.
+fn shared_blocks(side: &CameraSide, blocks: &[f64], damping: &[f64], terms: &[Term]) -> Vec<Vec<f64>> {
     let width = side.map.width();
     let mut shared: Vec<Vec<f64>> =
         side.map.shared.iter().map(|(_, n)| vec![0.0; packed(*n as usize)]).collect();
@@ -355,31 +348,9 @@ fn shared_blocks(side: &CameraSide, blocks: &[f64], damping: &[f64], priors: &[P
         for a in 0..*n as usize {
             block[packed(a) + a] += damping[*first as usize + a];
         }
-        let inside = |row: &&PriorRow| (*first as usize..(*first + *n) as usize).contains(&row.first);
-        for row in priors.iter().filter(inside) {
-            let a = row.first - *first as usize;
-            block[packed(a) + a] += row.weight * row.jacobian[0] * row.jacobian[0];
-        }
     }
+    known::add_to_shared_blocks(side, terms, &mut shared);
     shared
-}
-
-/// The priors as the coarse level wants them.
-fn coarse_priors(side: &CameraSide, priors: &[PriorRow]) -> (Vec<Vec<PosePrior>>, Vec<f64>) {
-    let mut of_pose: Vec<Vec<PosePrior>> = (0..side.map.of_pose.len()).map(|_| Vec::new()).collect();
-    let mut shared = vec![0.0; side.map.num_unknowns];
-    for row in priors {
-        match row.pose {
-            Some(pose) if row.local < 6 => {
-                let mut jacobian = SVector::<f64, 6>::zeros();
-                row.jacobian.iter().enumerate().for_each(|(a, j)| jacobian[row.local + a] = *j);
-                of_pose[pose as usize].push(PosePrior { jacobian, weight: row.weight });
-            }
-            Some(_) => {}
-            None => shared[row.first] += row.weight * row.jacobian[0] * row.jacobian[0],
-        }
-    }
-    (of_pose, shared)
 }
 
 #[cfg(test)]
@@ -417,7 +388,7 @@ mod prepared {
                 host: &mut self.host,
                 poses: &self.poses,
                 damping: &self.sums.damping,
-                priors: &self.sums.priors,
+                terms: &self.sums.terms,
             };
             Preconditioned { system, inverse: &mut self.inverse }
         }

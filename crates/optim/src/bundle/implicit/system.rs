@@ -1,13 +1,14 @@
 //! The reduced camera system over all parts, with damping and priors.
 
 use super::super::BundleError;
+use super::super::terms::Term;
 use super::conjugate_gradients::System;
 use super::host::PartHost;
+use super::known;
 use super::preconditioner::Inverse;
-use super::priors::PriorRow;
 use super::worker::{CameraSide, PartRequest};
 
-/// `S + λ D` and the priors, as a product.
+/// `S + λ D` with priors and marks, as a product.
 pub(super) struct CameraSystem<'a> {
     pub side: &'a CameraSide,
     pub host: &'a mut dyn PartHost,
@@ -15,7 +16,7 @@ pub(super) struct CameraSystem<'a> {
     pub poses: &'a [Vec<u32>],
     /// `λ D` of each unknown.
     pub damping: &'a [f64],
-    pub priors: &'a [PriorRow],
+    pub terms: &'a [Term],
 }
 
 impl CameraSystem<'_> {
@@ -34,11 +35,7 @@ impl CameraSystem<'_> {
                 self.side.map.scatter(*pose, local, &mut y);
             }
         }
-        for row in self.priors {
-            let range = row.first..row.first + row.jacobian.len();
-            let image: f64 = row.jacobian.iter().zip(&x[range.clone()]).map(|(j, x)| j * x).sum();
-            y[range].iter_mut().zip(&row.jacobian).for_each(|(y, j)| *y += row.weight * image * j);
-        }
+        known::add_product(self.side, self.terms, x, &mut y);
         Ok(y)
     }
 }

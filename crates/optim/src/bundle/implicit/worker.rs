@@ -7,7 +7,9 @@ use rayon::prelude::*;
 
 use super::super::layout::{Cameras, Layout};
 use super::super::step::Tried;
-use super::super::{BundleError, BundleOptions, BundleProblem, Precision, Preconditioner, ShardError};
+use super::super::{
+    AdjustedCameras, BundleError, BundleOptions, BundleProblem, Precision, Preconditioner, ShardError,
+};
 use super::clusters::Clusters;
 use super::coarse::{CoarseGroups, middles};
 use super::part::{CameraMap, Part};
@@ -67,8 +69,8 @@ impl CameraSide {
         observed: Vec<bool>,
         clusters: Clusters,
     ) -> Self {
-        let layout = Layout::new(&problem, &observed, None);
-        let map = CameraMap::new(&problem, &layout, &observed);
+        let layout = Layout::new(&problem, &observed, None, options.behind_camera);
+        let map = CameraMap::new(&problem, &layout);
         let coarse = CoarseGroups { num_clusters: clusters.count, shared: map.shared.clone() };
         Self { problem, options, observed, layout, map, clusters, coarse }
     }
@@ -93,43 +95,48 @@ impl CameraSide {
         &self.clusters
     }
 
-    /// The cameras at the start as numbers: seven of each pose, then the parameters of each of the intrinsics.
+    /// The cameras at the start as numbers: seven of each pose, the parameters of each of the intrinsics, three of each
+    /// position bias and of each landmark.
     pub fn flatten(&self) -> Vec<f64> {
-        self.flatten_cameras(&Cameras::new(self.problem.poses.clone(), self.problem.intrinsics.clone()))
+        self.flatten_cameras(&Cameras::of(&self.problem))
     }
 
-    /// Cameras as numbers: seven of each pose, then the parameters of each of the intrinsics.
+    /// Cameras as numbers, as [`CameraSide::flatten`].
     pub(super) fn flatten_cameras(&self, cameras: &Cameras) -> Vec<f64> {
         let poses = cameras.poses.iter().flat_map(|pose| {
             let (q, t) = (pose.rotation.coords, pose.translation);
             [q.x, q.y, q.z, q.w, t.x, t.y, t.z]
         });
         let intrinsics = cameras.intrinsics.iter().flat_map(|camera| camera.params().iter().copied());
-        poses.chain(intrinsics).collect()
+        let kept = cameras.biases_m.iter().chain(&cameras.landmarks).flat_map(|x| [x.x, x.y, x.z]);
+        poses.chain(intrinsics).chain(kept).collect()
     }
 
     /// The way back from [`CameraSide::flatten_cameras`].
     pub(super) fn unflatten(&self, numbers: &[f64]) -> Result<Cameras, BundleError> {
-        let (mut poses, mut intrinsics) = (self.problem.poses.clone(), self.problem.intrinsics.clone());
-        let params: usize = intrinsics.iter().map(|camera| camera.params().len()).sum();
-        if numbers.len() != 7 * poses.len() + params {
+        let mut cameras = Cameras::of(&self.problem);
+        let params: usize = cameras.intrinsics.iter().map(|camera| camera.params().len()).sum();
+        let kept = cameras.biases_m.len() + cameras.landmarks.len();
+        if numbers.len() != 7 * cameras.poses.len() + params + 3 * kept {
             return Err(BundleError::invalid(
                 "the cameras to go on from are those of another problem".to_owned(),
             ));
         }
-        let (of_poses, mut rest) = numbers.split_at(7 * poses.len());
-        for (pose, v) in poses.iter_mut().zip(of_poses.as_chunks::<7>().0) {
+        let (of_poses, mut rest) = numbers.split_at(7 * cameras.poses.len());
+        for (pose, v) in cameras.poses.iter_mut().zip(of_poses.as_chunks::<7>().0) {
             // As it was, to the last bit: not normalised again.
             let quaternion = nalgebra::Quaternion::new(v[3], v[0], v[1], v[2]);
             pose.rotation = nalgebra::UnitQuaternion::new_unchecked(quaternion);
             pose.translation = Vector3::new(v[4], v[5], v[6]);
         }
-        for camera in &mut intrinsics {
+        for camera in &mut cameras.intrinsics {
             let (own, after) = rest.split_at(camera.params().len());
             camera.params_mut().copy_from_slice(own);
             rest = after;
         }
-        Ok(Cameras::new(poses, intrinsics))
+        let targets = cameras.biases_m.iter_mut().chain(&mut cameras.landmarks);
+        targets.zip(rest.as_chunks::<3>().0).for_each(|(target, x)| *target = Vector3::from(*x));
+        Ok(Cameras::from(AdjustedCameras::from(cameras)))
     }
 
     pub(super) fn frame<'a>(&'a self, cameras: &'a Cameras) -> Frame<'a> {
@@ -189,7 +196,7 @@ struct Held {
 impl PartWorker {
     /// Nothing held yet. `memory_bytes` is for held parts; with a store, parts beyond it are read again for each request.
     pub fn new(side: Arc<CameraSide>, store: Option<Arc<dyn PartStore>>, memory_bytes: u64) -> Self {
-        let cameras = Cameras::new(side.problem.poses.clone(), side.problem.intrinsics.clone());
+        let cameras = Cameras::of(&side.problem);
         Self { side, cameras, next: None, step: 0, damping: 0.0, parts: Vec::new(), store, memory_bytes }
     }
 

@@ -22,8 +22,14 @@ fn refused(change: impl FnOnce(&mut BundleProblem, &mut BundleShard, &mut Bundle
 #[test]
 fn wrong_problems_are_refused_with_the_object_named() {
     let nan = f64::NAN;
-    let prior =
-        PositionPrior { pose: 3, center_in_world: Vector3::zeros(), sigma_m: Vector3::new(1.0, 0.0, 1.0) };
+    let prior = PositionPrior {
+        pose: 3,
+        center_in_world: Vector3::zeros(),
+        sigma_m: Vector3::new(1.0, 0.0, 1.0),
+        bias: None,
+    };
+    let good = PositionPrior { sigma_m: Vector3::repeat(1.0), ..prior };
+    let mark = Mark { pose: 1, landmark: 0, xy_px: [1.0, 1.0], sigma_px: 1.0 };
     let cases = [
         (refused(|p, _, _| p.poses[3].translation.x = nan), "pose 3"),
         (refused(|p, _, _| p.fixed_poses.truncate(1)), "fixed_poses"),
@@ -31,13 +37,38 @@ fn wrong_problems_are_refused_with_the_object_named() {
         (refused(|p, _, _| p.intrinsics_of_pose[2] = 9), "pose 2 names intrinsics 9"),
         (refused(|p, _, _| p.intrinsics[0].params_mut()[0] = -1.0), "intrinsics 0"),
         (refused(|p, _, _| p.intrinsics[0].params_mut()[3] = nan), "intrinsics 0"),
-        (refused(|p, _, _| p.position_priors.push(prior)), "position prior 0"),
-        (refused(|p, _, _| p.position_priors.push(PositionPrior { pose: 99, ..prior })), "position prior 0"),
+        (refused(|p, _, _| p.priors.positions.push(prior)), "position prior 0"),
+        (refused(|p, _, _| p.priors.positions.push(PositionPrior { pose: 99, ..prior })), "position prior 0"),
         (
             refused(|p, _, _| {
-                p.focal_priors.push(FocalPrior { intrinsics: 0, focal_px: 1.0, sigma_px: 0.0 })
+                p.priors.parameters.push(ParameterPrior { intrinsics: 0, param: 0, value: 1.0, sigma: 0.0 })
             }),
-            "focal prior 0",
+            "parameter prior 0",
+        ),
+        (
+            refused(|p, _, _| p.priors.positions.push(PositionPrior { bias: Some(2), ..good })),
+            "position prior 0 names position bias 2",
+        ),
+        (refused(|p, _, _| p.marks.push(mark)), "mark 0 names landmark 0"),
+        (
+            refused(|p, _, _| {
+                p.landmarks.push(Landmark { x_in_world: Vector3::new(0.0, nan, 0.0), fixed: false })
+            }),
+            "landmark 0 must be finite",
+        ),
+        (
+            refused(|p, _, _| {
+                let (from, to) = (Anchor::Pose(1), Anchor::Pose(1));
+                p.priors.distances.push(DistancePrior { from, to, length_m: 1.0, sigma_m: 0.1 })
+            }),
+            "distance prior 0 joins a thing to itself",
+        ),
+        (
+            refused(|p, _, _| {
+                let (down_in_cam, down_in_world) = (2.0 * Vector3::z(), Vector3::z());
+                p.priors.gravities.push(GravityPrior { pose: 1, down_in_cam, down_in_world, sigma_rad: 0.1 })
+            }),
+            "gravity prior 0 must have directions of unit length",
         ),
         (refused(|_, s, _| s.points[7].y = f64::INFINITY), "point 7"),
         (refused(|_, s, _| s.observations[5].pose = 1000), "observation 5"),

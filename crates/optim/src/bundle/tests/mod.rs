@@ -2,6 +2,7 @@
 
 mod bad_problems;
 mod normal_equations;
+mod priors;
 mod properties;
 mod truth;
 
@@ -196,8 +197,9 @@ pub(super) fn linearised_scene(num_params: usize) -> LinearisedScene {
     let scene = Scene::new(SceneOptions { model, num_intrinsics: 3, ..Default::default() });
     let (mut problem, shard) = scene.disturbed(3);
     problem.refine.fill(refine);
-    let cameras = super::layout::Cameras::new(problem.poses.clone(), problem.intrinsics.clone());
-    let layout = super::layout::Layout::new(&problem, &vec![true; problem.poses.len()], None);
+    let cameras = super::layout::Cameras::of(&problem);
+    let layout =
+        super::layout::Layout::new(&problem, &vec![true; problem.poses.len()], None, BehindCamera::LeaveOut);
     let dropped = super::plan::Dropped::find(&shard, &problem, &cameras, BehindCamera::LeaveOut);
     let plan = super::plan::ShardPlan::new(&shard, &dropped, &problem);
     let context = super::linearisation::Context {

@@ -8,6 +8,7 @@ use super::super::pattern::Covisibility;
 use super::super::plan::{Dropped, ShardPlan};
 use super::super::reduced::Reduced;
 use super::super::step::{CameraStep, try_step};
+use super::super::terms::{terms, ties};
 use super::*;
 
 struct Setup {
@@ -30,23 +31,67 @@ fn setup(model: CameraModel, num_intrinsics: usize, columns: usize) -> Setup {
     let scene = Scene::new(options);
     let (mut problem, mut shard) = scene.disturbed(3);
     problem.fixed_poses[2] = true;
-    problem.position_priors.push(PositionPrior {
-        pose: 1,
-        center_in_world: Vector3::new(1.0, 2.0, 9.0),
-        sigma_m: Vector3::new(0.5, 0.6, 0.7),
-    });
-    problem.focal_priors.push(FocalPrior { intrinsics: 0, focal_px: 870.0, sigma_px: 3.0 });
+    add_priors(&mut problem);
     // A point that a pose sees twice.
     let twice = shard.observations[0];
     shard
         .observations
         .insert(0, BundleObservation { xy_px: [twice.xy_px[0] + 2.0, twice.xy_px[1] - 1.0], ..twice });
-    let cameras = Cameras::new(problem.poses.clone(), problem.intrinsics.clone());
+    let cameras = Cameras::of(&problem);
     let plan =
         ShardPlan::new(&shard, &Dropped::find(&shard, &problem, &cameras, BehindCamera::LeaveOut), &problem);
     let observed: Vec<bool> = (0..problem.poses.len()).map(|pose| !plan.of_pose(pose).is_empty()).collect();
-    let layout = Layout::new(&problem, &observed, None);
+    let layout = Layout::new(&problem, &observed, None, BehindCamera::LeaveOut);
     Setup { problem, shard, layout, cameras, plan }
+}
+
+/// Every kind of prior, a landmark with marks, and a bias.
+fn add_priors(problem: &mut BundleProblem) {
+    let position = |pose: u32, bias| PositionPrior {
+        pose,
+        center_in_world: Vector3::new(3.0 * f64::from(pose), 2.0, 9.0),
+        sigma_m: Vector3::new(0.5, 0.6, 0.7),
+        bias,
+    };
+    problem.position_biases =
+        vec![PositionBias { bias_m: Vector3::new(0.1, -0.2, 0.3), sigma_m: Vector3::new(0.4, 0.5, 0.6) }];
+    let down_in_cam = Vector3::new(0.1, 0.05, 1.0).normalize();
+    let between = (problem.poses[0].center() - problem.poses[4].center()).norm();
+    problem.priors = Priors {
+        positions: vec![position(1, None), position(2, Some(0)), position(3, Some(0))],
+        gravities: vec![GravityPrior { pose: 0, down_in_cam, down_in_world: -Vector3::z(), sigma_rad: 0.01 }],
+        rotations: vec![RotationPrior {
+            pose: 3,
+            cam_from_world: UnitQuaternion::from_scaled_axis(Vector3::new(0.1, 0.2, -0.1))
+                * problem.poses[3].rotation,
+            sigma_rad: Vector3::new(0.02, 0.03, 0.04),
+        }],
+        parameters: ParameterPrior::focal(0, problem.intrinsics[0].model, 870.0, 3.0).collect(),
+        landmarks: vec![LandmarkPrior {
+            landmark: 0,
+            x_in_world: Vector3::new(1.1, 1.4, 0.2),
+            sigma_m: Vector3::new(0.02, 0.03, 0.04),
+        }],
+        distances: vec![
+            DistancePrior {
+                from: Anchor::Pose(0),
+                to: Anchor::Pose(4),
+                length_m: between + 0.05,
+                sigma_m: 0.02,
+            },
+            DistancePrior { from: Anchor::Landmark(1), to: Anchor::Pose(2), length_m: 9.5, sigma_m: 0.1 },
+        ],
+    };
+    let landmark = |x, y| Landmark { x_in_world: Vector3::new(x, y, 0.1), fixed: false };
+    problem.landmarks = vec![landmark(1.0, 1.5), landmark(3.0, 2.0)];
+    for (number, landmark) in [0, 1, 0, 1, 0].into_iter().enumerate() {
+        let pose = number as u32;
+        let x_in_cam = problem.poses[number].transform_point(&problem.landmarks[landmark].x_in_world);
+        let camera = &problem.intrinsics[problem.intrinsics_of_pose[number] as usize];
+        let xy = camera.project(&x_in_cam).unwrap();
+        let xy_px = [xy.x + 0.3, xy.y - 0.6];
+        problem.marks.push(Mark { pose, landmark: landmark as u32, xy_px, sigma_px: 0.5 });
+    }
 }
 
 impl Setup {
@@ -76,13 +121,8 @@ impl Setup {
             let xy = camera.project(&cameras.poses[o.pose as usize].transform_point(&x)).unwrap();
             residuals.extend([xy.x - f64::from(o.xy_px[0]), xy.y - f64::from(o.xy_px[1])]);
         }
-        let prior = &self.problem.position_priors[0];
-        let center = cameras.poses[prior.pose as usize].center();
-        residuals.extend((center - prior.center_in_world).component_div(&prior.sigma_m).iter());
-        let focal = &self.problem.focal_priors[0];
-        for f in &cameras.intrinsics[0].params()[..cameras.intrinsics[0].model.num_focal()] {
-            residuals.push((f - focal.focal_px) / focal.sigma_px);
-        }
+        let terms = terms(&self.problem, &self.layout, &cameras, &BundleOptions::default());
+        residuals.extend(terms.iter().flat_map(|term| &term.residual[..term.rows]));
         residuals
     }
 
@@ -139,6 +179,31 @@ fn jacobians_agree_with_differences() {
 }
 
 #[test]
+fn jacobians_of_priors_and_marks_agree_with_differences() {
+    for (model, n) in [(CameraModel::Pinhole, 1), (CameraModel::Radial, 0)] {
+        let setup = setup(model, n, 3);
+        let expected = setup.jacobian();
+        let mut row = 2 * setup.plan.observations.len();
+        let terms = terms(&setup.problem, &setup.layout, &setup.cameras, &BundleOptions::default());
+        // Three positions and their bias, gravity, rotation, focal lengths, a landmark, two distances, five marks.
+        assert_eq!(terms.len(), 14 + model.num_focal());
+        for term in &terms {
+            for component in 0..term.rows {
+                let mut got = DVector::zeros(expected.ncols());
+                for block in &term.blocks {
+                    let range = block.range(&setup.layout);
+                    range.zip(&block.columns).for_each(|(at, column)| got[at] = column[component]);
+                }
+                let expected = expected.row(row).transpose();
+                assert!((got - &expected).amax() < 1e-6 * (1.0 + expected.amax()), "{model:?} row {row}");
+                row += 1;
+            }
+        }
+        assert_eq!(row, expected.nrows());
+    }
+}
+
+#[test]
 fn schur_complement_gives_the_step_of_the_dense_normal_equations() {
     for (model, n, columns) in [
         (CameraModel::Pinhole, 1, 3),
@@ -168,7 +233,8 @@ fn schur_complement_gives_the_step_of_the_dense_normal_equations() {
 
         let mut covisibility = Covisibility::new(setup.problem.poses.len());
         covisibility.add(&setup.plan);
-        let (mut rows, pattern) = covisibility.rows(&setup.layout);
+        let ties = ties(&terms(&setup.problem, &setup.layout, &setup.cameras, &options));
+        let (mut rows, pattern) = covisibility.rows(&setup.layout, &ties);
         let offsets: Vec<usize> = (0..setup.layout.intrinsics.len())
             .map(|v| pattern.offset(setup.layout.poses.len() + v))
             .collect();

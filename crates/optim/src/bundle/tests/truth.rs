@@ -76,14 +76,15 @@ fn position_priors_place_the_scene() {
     let (mut problem, shard) = scene.disturbed(5);
     let mut noise = Noise::new(2);
     for (pose, truth) in scene.truth.poses.iter().enumerate() {
-        problem.position_priors.push(PositionPrior {
+        problem.priors.positions.push(PositionPrior {
             pose: pose as u32,
             center_in_world: truth.center() + 0.02 * noise.vector(),
             sigma_m: Vector3::repeat(0.02),
+            bias: None,
         });
     }
     // One receiver was lost: the robust prior forgets it.
-    problem.position_priors[4].center_in_world.x += 30.0;
+    problem.priors.positions[4].center_in_world.x += 30.0;
     let mut shards = InMemoryShards(vec![shard]);
     let options = BundleOptions { prior_loss: Loss::Cauchy, ..Default::default() };
     let report = solve(&mut problem, &mut shards, &options).unwrap();
@@ -102,7 +103,8 @@ fn position_priors_place_the_scene() {
 fn focal_prior_pulls_the_focal_length() {
     let scene = Scene::new(SceneOptions::default());
     let (mut problem, shard) = scene.disturbed(5);
-    problem.focal_priors = vec![FocalPrior { intrinsics: 0, focal_px: 950.0, sigma_px: 1e-3 }];
+    let model = problem.intrinsics[0].model;
+    problem.priors.parameters = ParameterPrior::focal(0, model, 950.0, 1e-3).collect();
     let mut shards = InMemoryShards(vec![shard]);
     solve(&mut problem, &mut shards, &BundleOptions::default()).unwrap();
     assert!((problem.intrinsics[0].mean_focal_px() - 950.0).abs() < 0.1);
