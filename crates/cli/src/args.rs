@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use terrane_pipeline::adjustment::{BundleSolver, Loss, Precision, Preconditioner};
+use terrane_pipeline::calibrate::Target;
 use terrane_pipeline::{CameraOverride, FeatureMethod, Matcher};
 
 /// Photographs in, one geo-referenced sparse reconstruction out.
@@ -54,6 +55,8 @@ pub enum Command {
     Compare(CompareFlags),
     /// Adjust a whole problem: a BAL file or a COLMAP model, in this process or on worker processes.
     Adjust(AdjustFlags),
+    /// A camera's intrinsics from photographs of a checkerboard or an AprilGrid.
+    Calibrate(CalibrateFlags),
     /// Hold parts of an adjustment for `adjust`, which starts this itself.
     #[command(hide = true)]
     Hold(HoldFlags),
@@ -310,6 +313,23 @@ pub struct AdjustFlags {
     /// Folder for parts of the problem while it is solved, which all workers can read [default: beside the result].
     #[arg(long, value_name = "FOLDER")]
     pub scratch: Option<PathBuf>,
+}
+
+/// Flags of `calibrate`.
+#[derive(Debug, Args)]
+pub struct CalibrateFlags {
+    /// Photographs of the target by one camera, or folders of them.
+    #[arg(required = true)]
+    pub photos: Vec<PathBuf>,
+    /// The target: checkerboard:COLUMNSxROWS[:SQUARE_M], of inner corners, or aprilgrid:COLUMNSxROWS[:TAG_M:SPACING].
+    #[arg(long, value_name = "TARGET")]
+    pub target: Target,
+    /// Camera model, as COLMAP names it.
+    #[arg(long, default_value = "OPENCV")]
+    pub model: String,
+    /// File for the camera, which --config of other commands reads.
+    #[arg(short, long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
 }
 
 /// Flags of `hold`.

@@ -2,6 +2,7 @@
 
 mod adjust;
 mod args;
+mod calibrate;
 mod compare;
 mod config;
 mod demo;
@@ -47,6 +48,7 @@ fn dispatch(arguments: Arguments) -> Result<(), Failure> {
         Command::Inspect(flags) => inspect::inspect(&flags, json),
         Command::Compare(flags) => compare::compare(&flags, json),
         Command::Adjust(flags) => adjust::adjust(&flags, json),
+        Command::Calibrate(flags) => calibrate::calibrate(&flags, json),
         Command::Hold(flags) => adjust::hold(flags),
         Command::Config(flags) => config::dump(&flags),
     }

@@ -16,6 +16,7 @@ pub mod retrieval;
 pub mod sift;
 mod simd;
 pub mod surf;
+pub mod targets;
 pub mod verification;
 
 pub use error::FrontendError;

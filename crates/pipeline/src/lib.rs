@@ -5,6 +5,7 @@
 //! This crate knows no network, no processes and no clocks; see `docs/conventions.md` for frames and units.
 
 pub mod adjustment;
+pub mod calibrate;
 mod config;
 mod error;
 mod execute;

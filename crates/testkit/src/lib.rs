@@ -12,4 +12,5 @@ pub mod files;
 pub mod homographies;
 pub mod mutate;
 pub mod scene;
+pub mod targets;
 pub mod town;
