@@ -183,6 +183,23 @@ fn blur(values: &[f64], width: usize, height: usize, sigma_px: f64) -> Vec<f64> 
     pass(&pass(values, true), false)
 }
 
+/// The same as a grey JPEG file.
+pub fn photograph(
+    pattern: &Pattern,
+    camera: &Camera,
+    cam_from_target: &Rigid3,
+    options: &RenderOptions,
+) -> Vec<u8> {
+    let (mut file, mut pixels) = (Vec::new(), render(pattern, camera, cam_from_target, options));
+    let side = |length: u32| length.min(u32::from(u16::MAX)) as u16;
+    let (width, height) = (side(camera.width_px), side(camera.height_px));
+    pixels.resize(usize::from(width) * usize::from(height), 0);
+    let encoder = jpeg_encoder::Encoder::new(&mut file, 95);
+    // Into memory, of a size that fits, encoding can't fail.
+    let _ = encoder.encode(&pixels, width, height, jpeg_encoder::ColorType::Luma);
+    file
+}
+
 /// A pose that shows all of a pattern, tilted by up to `tilt_rad` about both axes, turned and shifted at random.
 ///
 /// # Panics
