@@ -53,8 +53,11 @@ impl RefineIntrinsics {
     /// Every parameter.
     pub const ALL: Self = Self { focal: true, principal_point: true, distortion: true };
 
-    /// The indices of the refined parameters in `camera.params()`, ascending.
+    /// The indices of the refined parameters in `camera.params()`, ascending. Of a panorama there are none: its size is known.
     pub fn params(self, camera: &Camera) -> Vec<usize> {
+        if camera.model.is_spherical() {
+            return Vec::new();
+        }
         let num_focal = camera.model.num_focal();
         let mut params = Vec::new();
         if self.focal {
