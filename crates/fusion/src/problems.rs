@@ -1,6 +1,6 @@
 //! Whole problems that people bring, as the arrays of bundle adjustment, and back: BAL files and sparse models.
 
-use nalgebra::{Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{Rotation3, UnitQuaternion, Vector2, Vector3};
 use terrane_geometry::{Camera, CameraModel, Rigid3};
 use terrane_optim::bundle::{
     BehindCamera, BundleObservation, BundleProblem, BundleShard, InMemoryShards, RefineIntrinsics,
@@ -154,16 +154,18 @@ impl ResidualFigures {
                 let pose = o.pose as usize;
                 let x = rotations[pose] * shard.points[o.point as usize] + problem.poses[pose].translation;
                 let camera = &problem.intrinsics[problem.intrinsics_of_pose[pose] as usize];
-                let mirrored = whole.behind_camera == BehindCamera::Mirror && x.z < 0.0;
+                let mirrored =
+                    whole.behind_camera == BehindCamera::Mirror && x.z < 0.0 && camera.model.is_perspective();
                 let x = if mirrored { -x } else { x };
                 let Some(xy) = camera.project(&x).filter(|xy| xy.iter().all(|v| v.is_finite())) else {
                     figures.not_projected += 1;
                     continue;
                 };
-                let (dx, dy) = (xy.x - f64::from(o.xy_px[0]), xy.y - f64::from(o.xy_px[1]));
+                let observed = Vector2::new(f64::from(o.xy_px[0]), f64::from(o.xy_px[1]));
+                let error = camera.residual_px(&xy, &observed).norm();
                 figures.observations += 1;
-                figures.squared_cost += 0.5 * (dx * dx + dy * dy);
-                figures.sum_error_px += (dx * dx + dy * dy).sqrt();
+                figures.squared_cost += 0.5 * error * error;
+                figures.sum_error_px += error;
             }
         }
         figures

@@ -69,6 +69,14 @@ pub enum CalibrationError {
     /// No positive focal length fits.
     #[error("no camera fits the views; look for wrong correspondences")]
     NoCamera,
+    /// Only perspective models have a linear start.
+    #[error(
+        "{name} can't be calibrated from planar targets yet: choose a model from SIMPLE_PINHOLE to FULL_OPENCV"
+    )]
+    NotPerspective {
+        /// The model's name.
+        name: &'static str,
+    },
     /// The parameters of the model can't be told apart.
     #[error("the views don't determine all parameters; take more views or a model with fewer")]
     Undetermined,
@@ -81,6 +89,9 @@ pub fn calibrate(
     model: CameraModel,
     (width_px, height_px): (u32, u32),
 ) -> Result<Calibration, CalibrationError> {
+    if !model.is_perspective() {
+        return Err(CalibrationError::NotPerspective { name: model.name() });
+    }
     let mut homographies = Vec::with_capacity(views.len());
     for (view, points) in views.iter().enumerate() {
         if points.xy_on_target.len() != points.xy_px.len() {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use terrane_geometry::Camera;
+use terrane_geometry::{Camera, CameraModel};
 use terrane_optim::bundle::{
     self, BundleObservation, BundleOptions, BundleProblem, BundleReport, BundleShard, InMemoryShards,
     RefineIntrinsics,
@@ -200,5 +200,8 @@ pub(crate) fn is_sane(camera: &Camera, options: &AdjustmentOptions) -> bool {
         && center.y >= 0.0
         && center.x <= f64::from(camera.width_px)
         && center.y <= f64::from(camera.height_px);
-    ratio_holds && inside && camera.distortion().iter().all(|k| k.abs() <= options.max_distortion)
+    // What follows the principal point of these two is no polynomial's coefficient.
+    let free_form = matches!(camera.model, CameraModel::Fov | CameraModel::Eucm);
+    let mild = free_form || camera.distortion().iter().all(|k| k.abs() <= options.max_distortion);
+    ratio_holds && inside && mild
 }

@@ -27,7 +27,8 @@ pub(crate) fn initial_cameras(cluster: &Cluster<'_>, seed: Seed) -> (Vec<Camera>
     let mut cameras: Vec<Camera> = cluster.cameras.iter().map(|(_, record)| record.camera).collect();
     let mut guessed = vec![false; cameras.len()];
     for (at, (_, record)) in cluster.cameras.iter().enumerate() {
-        if record.focal_source != FocalSource::Guess {
+        // Fundamental matrices are those of perspective cameras.
+        if record.focal_source != FocalSource::Guess || !record.camera.model.is_perspective() {
             continue;
         }
         guessed[at] = true;

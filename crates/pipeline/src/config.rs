@@ -194,6 +194,11 @@ impl FromStr for CameraOverride {
                 names.join(", ")
             ))
         })?;
+        if model.is_spherical() {
+            return Err(PipelineError::invalid_input(format!(
+                "{name} photographs can be adjusted (terrane adjust) but not yet reconstructed: cut them into perspective views"
+            )));
+        }
         let params = params
             .split(',')
             .map(|number| number.trim().parse::<f64>())

@@ -21,6 +21,12 @@ impl GivenCamera {
     /// # Errors
     /// When the number of parameters does not fit the model, one is not finite, or a focal length is not positive.
     pub fn new(model: CameraModel, params: Vec<f64>) -> Result<Self, FrontendError> {
+        if model.is_spherical() {
+            return Err(FrontendError::invalid_option(format!(
+                "{} photographs can be adjusted (terrane adjust) but not yet reconstructed: cut them into perspective views",
+                model.name()
+            )));
+        }
         if params.len() != model.num_params() {
             return Err(FrontendError::invalid_option(format!(
                 "camera model {} takes {} parameters, {} were given",

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::layout::{Cameras, Layout};
 use super::plan::{Planned, ShardPlan};
-use super::projection::project_with_jacobian;
+use super::projection::{project_with_jacobian, residual_px};
 use super::terms::Term;
 use super::{BehindCamera, BundleProblem};
 use crate::Loss;
@@ -273,7 +273,7 @@ pub(super) fn linearise(
         intrinsics.fill(0.0);
         return 0.0;
     };
-    let residual = [0, 1].map(|row| projection.xy_px[row] - f64::from(observation.xy_px[row]));
+    let residual = residual_px(camera, &projection.xy_px, observation.xy_px);
     let squared = residual[0] * residual[0] + residual[1] * residual[1];
     let (rho, weight) = context.loss.evaluate(squared, context.loss_scale_px);
     let root = weight.sqrt();

@@ -15,9 +15,17 @@ pub(super) fn project(
 ) -> Option<Vector2<f64>> {
     match behind {
         // The formula divides by z, whatever its sign: the point on the other side of the centre has the same image.
-        BehindCamera::Mirror if x_in_cam.z < 0.0 => camera.project(&-x_in_cam),
+        BehindCamera::Mirror if x_in_cam.z < 0.0 && camera.model.is_perspective() => {
+            camera.project(&-x_in_cam)
+        }
         _ => camera.project(x_in_cam),
     }
+}
+
+/// What a projection differs from an observation by, in pixels; across the seam of a panorama the short way round.
+#[inline(always)]
+pub(super) fn residual_px(camera: &Camera, xy_px: &Vector2<f64>, observed_px: [f32; 2]) -> [f64; 2] {
+    camera.residual_px(xy_px, &Vector2::new(f64::from(observed_px[0]), f64::from(observed_px[1]))).into()
 }
 
 /// The same, with derivatives.
@@ -28,7 +36,7 @@ pub(super) fn project_with_jacobian(
     behind: BehindCamera,
 ) -> Option<Projection> {
     match behind {
-        BehindCamera::Mirror if x_in_cam.z < 0.0 => {
+        BehindCamera::Mirror if x_in_cam.z < 0.0 && camera.model.is_perspective() => {
             let mut projection = camera.project_with_jacobian(&-x_in_cam)?;
             projection.d_point = -projection.d_point;
             Some(projection)

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use super::layout::{Cameras, NONE};
 use super::linearisation::{Context, Linearisation};
 use super::plan::ShardPlan;
-use super::projection::project;
+use super::projection::{project, residual_px};
 
 /// A point's step is halved so often, at most, to keep the point in front of its cameras.
 const MAX_HALVINGS: u32 = 3;
@@ -185,7 +185,7 @@ fn point_cost(
         let pose = observation.pose as usize;
         let camera = &cameras.intrinsics[context.problem.intrinsics_of_pose[pose] as usize];
         let xy = project(camera, &cameras.x_in_cam(pose, x), context.behind)?;
-        let (dx, dy) = (xy.x - f64::from(observation.xy_px[0]), xy.y - f64::from(observation.xy_px[1]));
+        let [dx, dy] = residual_px(camera, &xy, observation.xy_px);
         cost += 0.5 * context.loss.evaluate(dx * dx + dy * dy, context.loss_scale_px).0;
     }
     cost.is_finite().then_some(cost)

@@ -209,7 +209,7 @@ impl Terms<'_> {
             lost.cost = f64::INFINITY;
             return Some(lost);
         };
-        let residual = (projection.xy_px - Vector2::from(mark.xy_px)) / mark.sigma_px;
+        let residual = camera.residual_px(&projection.xy_px, &Vector2::from(mark.xy_px)) / mark.sigma_px;
         let scale_sigma = self.options.loss_scale_px / mark.sigma_px;
         let mut term = Term::new(residual.push(0.0), self.options.loss, scale_sigma);
         let d_point: SMatrix<f64, 2, 3> = projection.d_point / mark.sigma_px;

@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 
 use super::super::layout::{Cameras, Layout};
 use super::super::linearisation::factorize_normal;
-use super::super::projection::project_with_jacobian;
+use super::super::projection::{project_with_jacobian, residual_px};
 use super::super::{BundleOptions, BundleProblem};
 use super::clusters::Clusters;
 use super::local::LocalFactor;
@@ -197,7 +197,7 @@ fn linearise<T: Real>(
     let Some(projection) = project_with_jacobian(camera, &x_in_cam, frame.options.behind_camera) else {
         return 0.0;
     };
-    let residual = [0, 1].map(|row| projection.xy_px[row] - f64::from(seen.xy_px[row]));
+    let residual = residual_px(camera, &projection.xy_px, seen.xy_px);
     let squared = residual[0] * residual[0] + residual[1] * residual[1];
     let (rho, weight) = frame.options.loss.evaluate(squared, frame.options.loss_scale_px);
     let root = weight.sqrt();

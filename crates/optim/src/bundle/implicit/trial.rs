@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use super::super::layout::Cameras;
-use super::super::projection::project;
+use super::super::projection::{project, residual_px};
 use super::super::step::Tried;
 use super::real::Real;
 use super::state::{Frame, PartState};
@@ -114,7 +114,7 @@ impl<T: Real> PartState<T> {
 fn cost(frame: &Frame<'_>, cameras: &Cameras, pose: usize, x: &Vector3<f64>, xy_px: [f32; 2]) -> Option<f64> {
     let camera = &cameras.intrinsics[frame.problem.intrinsics_of_pose[pose] as usize];
     let xy = project(camera, &cameras.x_in_cam(pose, x), frame.options.behind_camera)?;
-    let (dx, dy) = (xy.x - f64::from(xy_px[0]), xy.y - f64::from(xy_px[1]));
+    let [dx, dy] = residual_px(camera, &xy, xy_px);
     let cost = 0.5 * frame.options.loss.evaluate(dx * dx + dy * dy, frame.options.loss_scale_px).0;
     cost.is_finite().then_some(cost)
 }

@@ -109,3 +109,60 @@ fn focal_prior_pulls_the_focal_length() {
     solve(&mut problem, &mut shards, &BundleOptions::default()).unwrap();
     assert!((problem.intrinsics[0].mean_focal_px() - 950.0).abs() < 0.1);
 }
+
+/// A ring of cameras that look outwards and inwards at a shell of points, so that wide views are used to their borders.
+fn ring(camera: Camera, refine: RefineIntrinsics) -> Scene {
+    let mut noise = Noise::new(17);
+    let poses: Vec<Rigid3> = (0..10)
+        .map(|i| {
+            let angle = 0.6283 * f64::from(i);
+            let center = Vector3::new(3.0 * angle.cos(), 3.0 * angle.sin(), 0.3 * noise.next());
+            let rotation = UnitQuaternion::from_scaled_axis(0.2 * noise.vector() + Vector3::z() * angle);
+            Rigid3::from_rotation_and_center(rotation, &center)
+        })
+        .collect();
+    let truth = BundleProblem::new(poses, vec![camera], vec![0; 10], refine);
+    let mut shard = BundleShard::default();
+    while shard.points.len() < 400 {
+        let x = noise.vector().normalize() * noise.uniform(5.0..9.0);
+        let seen = observe(&truth, shard.points.len() as u32, &x, 0.5, &mut noise);
+        if seen.len() >= 3 {
+            shard.observations.extend(seen);
+            shard.points.push(x);
+        }
+    }
+    Scene { truth, shard }
+}
+
+#[test]
+fn fisheyes_and_panoramas_reach_the_cost_that_the_noise_predicts() {
+    let fisheye = [300.0, 301.0, 500.0, 400.0, 0.03, -0.01, 0.002, -0.0004];
+    let fisheye = Camera::new(CameraModel::OpenCvFisheye, 1000, 800, &fisheye).unwrap();
+    let panorama = Camera::new(CameraModel::Equirectangular, 2000, 1000, &[2000.0, 1000.0]).unwrap();
+    for (camera, refine) in
+        [(fisheye, RefineIntrinsics::FOCAL_AND_DISTORTION), (panorama, RefineIntrinsics::ALL)]
+    {
+        let scene = ring(camera, refine);
+        for solver in [BundleSolver::Explicit, BundleSolver::Implicit] {
+            let (mut problem, shard) = (scene.truth.clone(), scene.shard.clone());
+            let mut noise = Noise::new(3);
+            for pose in &mut problem.poses {
+                let (turn, shift) = (noise.vector() * 0.01, noise.vector() * 0.05);
+                *pose = pose
+                    .retract_left(&nalgebra::Vector6::new(turn.x, turn.y, turn.z, shift.x, shift.y, shift.z));
+            }
+            let mut shards = InMemoryShards(vec![shard]);
+            let options = BundleOptions { solver, ..Default::default() };
+            let report = solve(&mut problem, &mut shards, &options).unwrap();
+            assert!(report.termination.converged(), "{:?}: {report:?}", camera.model);
+            let ratio = report.final_cost / expected_cost(&report, 0.5);
+            assert!((0.9..1.1).contains(&ratio), "{:?} {solver:?}: {ratio}", camera.model);
+            let rmse = center_rmse(&problem.poses, &scene.truth.poses);
+            assert!((1e-4..0.02).contains(&rmse), "{:?}: {rmse}", camera.model);
+        }
+    }
+    // Pixels near both borders are of points behind the first camera: the seam is crossed.
+    let scene = ring(panorama, RefineIntrinsics::ALL);
+    let near_seam = scene.shard.observations.iter().filter(|o| o.xy_px[0] < 20.0 || o.xy_px[0] > 1980.0);
+    assert!(near_seam.count() > 30);
+}
