@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use terrane_geometry::{Camera, CameraModel};
 use terrane_pipeline::calibrate::{CalibrationReport, calibrate_photographs};
+use terrane_pipeline::is_photograph;
 
 use crate::args::CalibrateFlags;
 use crate::exit::Failure;
@@ -11,8 +12,7 @@ use crate::exit::Failure;
 /// Finds corners, calibrates, writes, prints.
 pub fn calibrate(flags: &CalibrateFlags, json: bool) -> Result<(), Failure> {
     let model = CameraModel::from_name(&flags.model.to_ascii_uppercase()).ok_or_else(|| {
-        let names: Vec<_> = CameraModel::ALL.iter().map(|model| model.name()).collect();
-        Failure::input(format!("--model {}: use one of {}", flags.model, names.join(", ")))
+        Failure::input(format!("--model {}: use one of {}", flags.model, CameraModel::names()))
     })?;
     let paths = photographs(&flags.photos)?;
     let report = calibrate_photographs(&paths, &flags.target, model)
@@ -55,8 +55,7 @@ fn photographs(named: &[PathBuf]) -> Result<Vec<PathBuf>, Failure> {
         let mut within = Vec::new();
         for entry in std::fs::read_dir(path).map_err(failed)? {
             let file = entry.map_err(failed)?.path();
-            let extension = file.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
-            if ["jpg", "jpeg", "png", "tif", "tiff"].contains(&extension.as_str()) {
+            if file.file_name().and_then(|name| name.to_str()).is_some_and(is_photograph) {
                 within.push(file);
             }
         }

@@ -154,9 +154,7 @@ impl ResidualFigures {
                 let pose = o.pose as usize;
                 let x = rotations[pose] * shard.points[o.point as usize] + problem.poses[pose].translation;
                 let camera = &problem.intrinsics[problem.intrinsics_of_pose[pose] as usize];
-                let mirrored =
-                    whole.behind_camera == BehindCamera::Mirror && x.z < 0.0 && camera.model.is_perspective();
-                let x = if mirrored { -x } else { x };
+                let x = if whole.behind_camera.mirrors(camera, &x) { -x } else { x };
                 let Some(xy) = camera.project(&x).filter(|xy| xy.iter().all(|v| v.is_finite())) else {
                     figures.not_projected += 1;
                     continue;

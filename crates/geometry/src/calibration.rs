@@ -45,6 +45,14 @@ pub struct Calibration {
     pub pose_covariances: Vec<Matrix6<f64>>,
 }
 
+impl Calibration {
+    /// The largest sine of an angle between the target's planes in two views.
+    pub fn largest_tilt_sine(&self) -> f64 {
+        let normals: Vec<_> = self.cam_from_target.iter().map(|pose| pose.rotation * Vector3::z()).collect();
+        largest_sine(&normals)
+    }
+}
+
 /// Why views give no intrinsics.
 #[derive(Clone, Copy, Debug, PartialEq, Error)]
 pub enum CalibrationError {
@@ -107,8 +115,7 @@ pub fn calibrate(
     let start = start::best(views, &homographies, &blank)?;
     let found = refine::refined(views, start)?;
     // Distortion can feign tilts, which refinement takes back.
-    let normals: Vec<_> = found.cam_from_target.iter().map(|pose| pose.rotation * Vector3::z()).collect();
-    if !(largest_sine(&normals) > MIN_TILT) {
+    if !(found.largest_tilt_sine() > MIN_TILT) {
         return Err(CalibrationError::ParallelViews);
     }
     Ok(found)

@@ -2,7 +2,6 @@
 
 use std::path::{Path, PathBuf};
 
-use nalgebra::Vector3;
 use rayon::prelude::*;
 use serde::Serialize;
 use terrane_frontend::image::{DecodeOptions, decode, probe};
@@ -66,9 +65,8 @@ pub fn calibrate_photographs(
     target: &Target,
     model: CameraModel,
 ) -> Result<CalibrationReport, PipelineError> {
-    let size = common_size(paths)?;
-    let views: Vec<Result<TargetView, String>> =
-        paths.par_iter().map(|path| view_of(path, target)).collect::<Result<_, _>>()?;
+    let looks: Vec<Look> = paths.par_iter().map(|path| Look::at(path, target)).collect::<Result<_, _>>()?;
+    let size = common_size(paths, &looks)?;
     let mut report = CalibrationReport {
         photographs: Vec::with_capacity(paths.len()),
         camera: None,
@@ -78,8 +76,8 @@ pub fn calibrate_photographs(
         warnings: Vec::new(),
     };
     let mut used = Vec::new();
-    for (index, (path, view)) in paths.iter().zip(&views).enumerate() {
-        let (corners, unused) = match view {
+    for (index, (path, look)) in paths.iter().zip(&looks).enumerate() {
+        let (corners, unused) = match &look.view {
             Ok(view) if view.xy_px.len() >= MIN_CORNERS => {
                 used.push(index);
                 (view.xy_px.len(), None)
@@ -89,7 +87,7 @@ pub fn calibrate_photographs(
         };
         report.photographs.push(PhotographReport { path: path.clone(), corners, rms_px: None, unused });
     }
-    let views: Vec<TargetView> = views.into_iter().map(Result::unwrap_or_default).collect();
+    let views: Vec<TargetView> = looks.into_iter().map(|look| look.view.unwrap_or_default()).collect();
     match fitted(&views, &mut used, model, size, &mut report.photographs) {
         Ok(found) => {
             for (&index, rms_px) in used.iter().zip(errors_px(&found, &views, &used)) {
@@ -107,12 +105,11 @@ pub fn calibrate_photographs(
 }
 
 /// The size of all photographs that are photographs at all.
-fn common_size(paths: &[PathBuf]) -> Result<(u32, u32), PipelineError> {
+fn common_size(paths: &[PathBuf], looks: &[Look]) -> Result<(u32, u32), PipelineError> {
     let mut first: Option<(&Path, (u32, u32))> = None;
     let mut others = Vec::new();
-    for path in paths {
-        let Ok(probe) = probe(&read(path)?) else { continue };
-        let size = (probe.width, probe.height);
+    for (path, look) in paths.iter().zip(looks) {
+        let Some(size) = look.size else { continue };
         match first {
             None => first = Some((path, size)),
             Some((_, common)) if common != size => {
@@ -136,18 +133,26 @@ fn common_size(paths: &[PathBuf]) -> Result<(u32, u32), PipelineError> {
     )))
 }
 
-fn read(path: &Path) -> Result<Vec<u8>, PipelineError> {
-    std::fs::read(path)
-        .map_err(|error| PipelineError::invalid_input(format!("can't read {}: {error}", path.display())))
+/// What one look at a file says.
+struct Look {
+    /// Its width and height in pixels, when it is a photograph.
+    size: Option<(u32, u32)>,
+    /// The target in it, or why that isn't there.
+    view: Result<TargetView, String>,
 }
 
-/// The target in a photograph, or why it isn't there.
-fn view_of(path: &Path, target: &Target) -> Result<Result<TargetView, String>, PipelineError> {
-    let options = DecodeOptions { color: false, ..DecodeOptions::default() };
-    let decoded = decode(&read(path)?, &options);
-    Ok(decoded
-        .map_err(|error| error.to_string())
-        .and_then(|image| detect(target, &image.luma).map_err(|reason| reason.to_string())))
+impl Look {
+    fn at(path: &Path, target: &Target) -> Result<Self, PipelineError> {
+        let bytes = std::fs::read(path).map_err(|error| {
+            PipelineError::invalid_input(format!("can't read {}: {error}", path.display()))
+        })?;
+        let size = probe(&bytes).ok().map(|probe| (probe.width, probe.height));
+        let options = DecodeOptions { color: false, ..DecodeOptions::default() };
+        let view = decode(&bytes, &options)
+            .map_err(|error| error.to_string())
+            .and_then(|image| detect(target, &image.luma).map_err(|reason| reason.to_string()));
+        Ok(Self { size, view })
+    }
 }
 
 fn fit(
@@ -211,10 +216,7 @@ fn warnings(found: &Calibration, views: &[TargetView], used: &[usize]) -> Vec<St
             used.len()
         ));
     }
-    let normals: Vec<Vector3<f64>> =
-        found.cam_from_target.iter().map(|pose| pose.rotation * Vector3::z()).collect();
-    let pairs = normals.iter().enumerate().flat_map(|(i, a)| normals[..i].iter().map(move |b| (a, b)));
-    let tilt_deg = pairs.map(|(a, b)| a.cross(b).norm().asin()).fold(0.0, f64::max).to_degrees();
+    let tilt_deg = found.largest_tilt_sine().min(1.0).asin().to_degrees();
     if tilt_deg < GOOD_TILT_DEG {
         warnings.push(format!(
             "the target's planes differ by {tilt_deg:.0}° at most: tilt it by 20° to 45° both ways"

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
+use terrane_frontend::cameras::GivenCamera;
 use terrane_frontend::corners::CornerOptions;
 use terrane_frontend::features::{FeatureMethod, FeatureOptions};
 use terrane_frontend::image::DecodeOptions;
@@ -161,22 +162,16 @@ impl CameraOverride {
     /// The camera of an image of this size.
     ///
     /// # Errors
-    /// When the number of parameters does not fit the model or a focal length is not positive.
+    /// When the number of parameters does not fit the model, a focal length is not positive, or the model can't be
+    /// reconstructed.
     pub fn camera(&self, width_px: u32, height_px: u32) -> Result<Camera, PipelineError> {
-        let camera = Camera::new(self.model, width_px, height_px, &self.params).ok_or_else(|| {
-            PipelineError::invalid_input(format!(
-                "camera {} needs {} parameters, {} were given",
-                self.model.name(),
-                self.model.num_params(),
-                self.params.len()
-            ))
-        })?;
-        let focal = camera.focal_px();
-        if self.params.iter().all(|value| value.is_finite()) && focal.x > 0.0 && focal.y > 0.0 {
-            Ok(camera)
-        } else {
-            Err(PipelineError::invalid_input("camera parameters must be finite and focal lengths above zero"))
-        }
+        Ok(self.given()?.camera(width_px, height_px))
+    }
+
+    /// The same as the front end takes it.
+    pub(crate) fn given(&self) -> Result<GivenCamera, PipelineError> {
+        GivenCamera::new(self.model, self.params.clone())
+            .map_err(|error| PipelineError::invalid_input(error.to_string()))
     }
 }
 
@@ -188,17 +183,11 @@ impl FromStr for CameraOverride {
             PipelineError::invalid_input(format!("camera `{text}` is not of the form MODEL:p1,p2,…"))
         })?;
         let model = CameraModel::from_name(name).ok_or_else(|| {
-            let names: Vec<_> = CameraModel::ALL.iter().map(|model| model.name()).collect();
             PipelineError::invalid_input(format!(
                 "camera model `{name}` is unknown: use one of {}",
-                names.join(", ")
+                CameraModel::names()
             ))
         })?;
-        if model.is_spherical() {
-            return Err(PipelineError::invalid_input(format!(
-                "{name} photographs can be adjusted (terrane adjust) but not yet reconstructed: cut them into perspective views"
-            )));
-        }
         let params = params
             .split(',')
             .map(|number| number.trim().parse::<f64>())

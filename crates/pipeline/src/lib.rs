@@ -23,6 +23,7 @@ pub use config::{CameraOverride, RunConfig, WorkerHints};
 pub use error::{PipelineError, TaskError};
 pub use execute::{Cancel, ExecutionContext, execute};
 pub use key::{ArtefactKey, KeyBuilder};
+pub use listing::is_photograph;
 pub use plan::{KnownArtefacts, Plan, PlanState, RunFigures, StageProgress, plan};
 pub use stage::Stage;
 pub use store::{Put, Store};

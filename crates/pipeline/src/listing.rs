@@ -165,7 +165,8 @@ fn scan_folder(config: &RunConfig) -> Result<Vec<String>, PipelineError> {
     Ok(paths)
 }
 
-fn is_photograph(name: &str) -> bool {
+/// Whether a file's name ends like that of a photograph that terrane reads.
+pub fn is_photograph(name: &str) -> bool {
     let extension = name.rsplit_once('.').map(|(_, extension)| extension.to_ascii_lowercase());
     extension.is_some_and(|extension| EXTENSIONS.contains(&extension.as_str()))
 }

@@ -62,10 +62,9 @@ impl FromStr for GivenCamera {
             ))
         })?;
         let model = CameraModel::from_name(&name.trim().to_ascii_uppercase()).ok_or_else(|| {
-            let names: Vec<&str> = CameraModel::ALL.iter().map(|model| model.name()).collect();
             FrontendError::invalid_option(format!(
                 "camera model '{name}' is unknown: use one of {}",
-                names.join(", ")
+                CameraModel::names()
             ))
         })?;
         let params = params

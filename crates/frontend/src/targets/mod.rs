@@ -81,14 +81,13 @@ pub enum NotFound {
 /// # Errors
 /// The reason, when the target isn't there or can't be used.
 pub fn detect(target: &Target, image: &GrayImage) -> Result<TargetView, NotFound> {
-    const SMALLEST_SIDE_PX: usize = 120;
-    const FIRST_SIDE_PX: usize = 1000;
+    const LARGEST_COARSE_SIDE_PX: usize = 240;
     if image.width.saturating_mul(image.height) != image.data.len() {
         return Err(NotFound::Nothing);
     }
     let mut levels = vec![FloatImage::new(image)];
     while let Some(last) = levels.last()
-        && last.width.max(last.height) > FIRST_SIDE_PX.min(2 * SMALLEST_SIDE_PX)
+        && last.width.max(last.height) > LARGEST_COARSE_SIDE_PX
         && let Some(half) = last.halved()
     {
         levels.push(half);

@@ -48,34 +48,39 @@ fn grid() -> Pattern {
     Pattern::aprilgrid(4, 3, 0.06, 0.3, &tag36h11::CODES)
 }
 
+/// A condition, how it is rendered, the fewest views to be found, and the worst error allowed.
+type Case = (&'static str, RenderOptions, usize, f64);
+
+fn found_and_placed(target: &str, pattern: &Pattern, count: u64, cases: &[Case]) {
+    for (name, options, least, bound_px) in cases {
+        let (found, worst_px) = rate(target, pattern, options, count);
+        println!("{target}, {name}: {found} of {count}, worst {worst_px:.3} px");
+        assert!(found >= *least && worst_px < *bound_px, "{name}: {found} of {count}, {worst_px} px");
+    }
+}
+
 #[test]
 fn checkerboards_are_found_and_placed() {
     let clean = RenderOptions::default();
-    for (name, options, least, bound_px) in [
-        ("clean", clean, 9, 0.06),
-        ("noise", RenderOptions { noise_greys: 6.0, ..clean }, 9, 0.12),
-        ("blur", RenderOptions { blur_px: 1.5, ..clean }, 9, 0.1),
-        ("vignette", RenderOptions { vignette: 0.5, noise_greys: 3.0, ..clean }, 9, 0.12),
-        ("clutter", RenderOptions { clutter: true, ..clean }, 9, 0.06),
-    ] {
-        let (found, worst_px) = rate("checkerboard:9x6:0.03", &board(), &options, 10);
-        println!("checkerboard, {name}: {found} of 10, worst {worst_px:.3} px");
-        assert!(found >= least && worst_px < bound_px, "{name}: {found} of 10, {worst_px} px");
-    }
+    let cases = [
+        ("clean", clean, 10, 0.06),
+        ("noise", RenderOptions { noise_greys: 6.0, ..clean }, 10, 0.12),
+        ("blur", RenderOptions { blur_px: 1.5, ..clean }, 10, 0.1),
+        ("vignette", RenderOptions { vignette: 0.5, noise_greys: 3.0, ..clean }, 10, 0.12),
+        ("clutter", RenderOptions { clutter: true, ..clean }, 10, 0.06),
+    ];
+    found_and_placed("checkerboard:9x6:0.03", &board(), 10, &cases);
 }
 
 #[test]
 fn april_grids_are_found_and_placed() {
     let clean = RenderOptions::default();
-    for (name, options, least, bound_px) in [
+    let cases = [
         ("clean", clean, 5, 0.1),
         ("noise", RenderOptions { noise_greys: 4.0, ..clean }, 5, 0.2),
         ("clutter", RenderOptions { clutter: true, ..clean }, 5, 0.1),
-    ] {
-        let (found, worst_px) = rate("aprilgrid:4x3:0.06:0.3", &grid(), &options, 5);
-        println!("aprilgrid, {name}: {found} of 5, worst {worst_px:.3} px");
-        assert!(found >= least && worst_px < bound_px, "{name}: {found} of 5, {worst_px} px");
-    }
+    ];
+    found_and_placed("aprilgrid:4x3:0.06:0.3", &grid(), 5, &cases);
 }
 
 #[test]

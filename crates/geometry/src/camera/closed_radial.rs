@@ -122,10 +122,10 @@ pub(super) fn ray(model: CameraModel, k: &[f64], distorted: &Vector2<f64>) -> Op
             if !(angle < std::f64::consts::FRAC_PI_2 && omega.abs() < std::f64::consts::PI) {
                 return None;
             }
-            let (a, ratio, _) = fov_scale(omega);
+            let (_, ratio, _) = fov_scale(omega);
             let tangent_over_angle = if angle > 1e-9 { angle.tan() / angle } else { 1.0 };
-            // r / r_d = tan(r_d ω) / (a r_d).
-            (distorted * (tangent_over_angle / ratio)).push(if a.is_finite() { 1.0 } else { f64::NAN })
+            // r / r_d = tan(r_d ω) / (2 tan(ω/2) r_d).
+            (distorted * (tangent_over_angle / ratio)).push(1.0)
         }
         // Beyond k r_d² = 1 radii shrink again.
         (CameraModel::SimpleDivision | CameraModel::Division, &[k]) if k * r2 < 1.0 => {

@@ -168,42 +168,52 @@ fn fold_r2(k1: f64, k2: f64) -> f64 {
 
 /// Polynomial models shrink to one equation in the radius, which grows up to the fold: Newton's method inside a bracket.
 fn undistort_radial(k1: f64, k2: f64, distorted: &Vector2<f64>) -> Option<Vector2<f64>> {
-    const MAX_ITERATIONS: usize = 60;
     let target = distorted.norm();
     if target < f64::EPSILON || k1 == 0.0 && k2 == 0.0 {
         return target.is_finite().then_some(*distorted);
     }
-    let (mut low, mut high) = (0.0, fold_r2(k1, k2).sqrt());
+    let high = fold_r2(k1, k2).sqrt();
     let value = |r: f64| r * (1.0 + r * r * (k1 + r * r * k2)) - target;
     if high.is_finite() && !(value(high) > 0.0) || !target.is_finite() {
         return None;
     }
-    let mut r = if target < high { target } else { 0.5 * high };
+    let start = if target < high { target } else { 0.5 * high };
+    let r = growing_root(start, high, |r| {
+        let r2 = r * r;
+        (value(r), 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2))
+    });
+    Some(distorted * (r / target))
+}
+
+/// Where a function that grows from zero to `high`, which may be infinite, vanishes: Newton's method inside a bracket. The
+/// function gives its value and its slope.
+pub(super) fn growing_root(start: f64, high: f64, function: impl Fn(f64) -> (f64, f64)) -> f64 {
+    const MAX_ITERATIONS: usize = 60;
+    let (mut at, mut low, mut high) = (start, 0.0, high);
     for _ in 0..MAX_ITERATIONS {
-        let residual = value(r);
-        if residual == 0.0 {
+        let (value, slope) = function(at);
+        if value == 0.0 {
             break;
         }
-        if residual > 0.0 {
-            high = r
+        if value > 0.0 {
+            high = at
         } else {
-            low = r
+            low = at
         }
-        let r2 = r * r;
-        let newton = r - residual / (1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2));
+        let newton = at - value / slope;
         let inside = newton > low && newton < high;
         let next = match (inside, high.is_finite()) {
             (true, _) => newton,
             (false, true) => 0.5 * (low + high),
-            (false, false) => 2.0 * r,
+            (false, false) => 2.0 * at,
         };
-        let step = (next - r).abs();
-        r = next;
-        if step <= 1e-15 * r {
+        let step = (next - at).abs();
+        at = next;
+        if step <= 1e-15 * at {
             break;
         }
     }
-    Some(distorted * (r / target))
+    at
 }
 
 /// Newton's method in the plane.

@@ -12,6 +12,7 @@ use std::f64::consts::PI;
 
 use nalgebra::{Matrix2, SMatrix, Vector2, Vector3};
 
+use super::distortion::growing_root;
 use super::{CameraModel, Image};
 
 /// The most radial coefficients of a fisheye.
@@ -138,34 +139,16 @@ impl Terms {
 
     /// The angle of a distorted one, by Newton's method inside a bracket.
     fn angle_rad(&self, distorted_rad: f64) -> Option<f64> {
-        const MAX_ITERATIONS: usize = 100;
-        let (mut low, mut high) = (0.0, self.fold_rad());
+        let high = self.fold_rad();
         let value = |theta: f64| theta * self.gain(theta * theta).0 - distorted_rad;
         if !(value(high) >= 0.0) {
             return None;
         }
-        let mut theta = distorted_rad.min(0.5 * high);
-        for _ in 0..MAX_ITERATIONS {
-            let residual = value(theta);
-            if residual == 0.0 {
-                break;
-            }
-            if residual > 0.0 {
-                high = theta
-            } else {
-                low = theta
-            }
+        Some(growing_root(distorted_rad.min(0.5 * high), high, |theta| {
             let s = theta * theta;
             let (gain, d_gain) = self.gain(s);
-            let newton = theta - residual / (gain + 2.0 * s * d_gain);
-            let next = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
-            let step = (next - theta).abs();
-            theta = next;
-            if step <= 1e-15 * theta {
-                break;
-            }
-        }
-        Some(theta)
+            (theta * gain - distorted_rad, gain + 2.0 * s * d_gain)
+        }))
     }
 
     /// The equidistant point of a distorted one.

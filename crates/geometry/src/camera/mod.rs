@@ -178,16 +178,7 @@ impl Camera {
         let distorted = distortion::distort_with_jacobian(self.model, self.distortion(), &normalized)?;
         let focal = self.scale_px();
         let d_point = point_jacobian(&focal, &distorted.d_xy, &normalized, inverse_z);
-        let num_focal = self.model.num_focal();
-        let mut d_params = SMatrix::<f64, 2, MAX_PARAMS>::zeros();
-        d_params[(0, 0)] = distorted.xy.x;
-        d_params[(1, num_focal - 1)] = distorted.xy.y;
-        d_params[(0, num_focal)] = 1.0;
-        d_params[(1, num_focal + 1)] = 1.0;
-        for k in 0..self.model.num_distortion() {
-            d_params[(0, num_focal + 2 + k)] = focal.x * distorted.d_coefficients[(0, k)];
-            d_params[(1, num_focal + 2 + k)] = focal.y * distorted.d_coefficients[(1, k)];
-        }
+        let d_params = self.d_params(&focal, &distorted.xy, &distorted.d_coefficients);
         let xy_px = self.offset_px() + focal.component_mul(&distorted.xy);
         Some(Projection { xy_px, d_point, d_params })
     }
@@ -199,7 +190,7 @@ impl Camera {
         x_in_cam: &Vector3<f64>,
     ) -> Option<(Vector2<f64>, SMatrix<f64, 2, 3>)> {
         if !self.model.is_perspective() {
-            return self.project_wide_with_point_jacobian(x_in_cam);
+            return self.project_wide_with_jacobian(x_in_cam).map(|seen| (seen.xy_px, seen.d_point));
         }
         if !(x_in_cam.z > f64::EPSILON) {
             return None;
@@ -264,7 +255,6 @@ impl Camera {
     #[inline(never)]
     fn project_wide_with_jacobian(&self, x_in_cam: &Vector3<f64>) -> Option<Projection> {
         let focal = self.focal_px();
-        let mut d_params = SMatrix::<f64, 2, MAX_PARAMS>::zeros();
         let image = match self.model.family() {
             Family::Fisheye => fisheye::project_with_jacobian(self.model, self.distortion(), x_in_cam),
             Family::ClosedRadial => {
@@ -272,31 +262,37 @@ impl Camera {
             }
             Family::Perspective | Family::Spherical => {
                 let (xy, d_point) = spherical::project_with_jacobian(x_in_cam)?;
+                let mut d_params = SMatrix::<f64, 2, MAX_PARAMS>::zeros();
                 d_params[(0, 0)] = 0.5 + xy.x / std::f64::consts::TAU;
                 d_params[(1, 1)] = 0.5 + xy.y / std::f64::consts::PI;
                 let xy_px = self.principal_point_px() + focal.component_mul(&xy);
                 return Some(Projection { xy_px, d_point: scaled_rows(&focal, &d_point), d_params });
             }
         }?;
-        let num_focal = self.model.num_focal();
-        d_params[(0, 0)] = image.xy.x;
-        d_params[(1, num_focal - 1)] = image.xy.y;
-        d_params[(0, num_focal)] = 1.0;
-        d_params[(1, num_focal + 1)] = 1.0;
-        for k in 0..self.model.num_distortion() {
-            let column = focal.component_mul(&image.d_coefficients.column(k));
-            d_params.set_column(num_focal + 2 + k, &column);
-        }
+        let d_params = self.d_params(&focal, &image.xy, &image.d_coefficients);
         let xy_px = self.principal_point_px() + focal.component_mul(&image.xy);
         Some(Projection { xy_px, d_point: scaled_rows(&focal, &image.d_point), d_params })
     }
 
-    #[inline(never)]
-    fn project_wide_with_point_jacobian(
+    /// The derivative in the parameters from the image for a focal length of one and its derivative in the distortion.
+    #[inline(always)]
+    fn d_params<const N: usize>(
         &self,
-        x_in_cam: &Vector3<f64>,
-    ) -> Option<(Vector2<f64>, SMatrix<f64, 2, 3>)> {
-        self.project_wide_with_jacobian(x_in_cam).map(|projection| (projection.xy_px, projection.d_point))
+        focal_px: &Vector2<f64>,
+        xy: &Vector2<f64>,
+        d_coefficients: &SMatrix<f64, 2, N>,
+    ) -> SMatrix<f64, 2, MAX_PARAMS> {
+        let num_focal = self.model.num_focal();
+        let mut d_params = SMatrix::<f64, 2, MAX_PARAMS>::zeros();
+        d_params[(0, 0)] = xy.x;
+        d_params[(1, num_focal - 1)] = xy.y;
+        d_params[(0, num_focal)] = 1.0;
+        d_params[(1, num_focal + 1)] = 1.0;
+        for k in 0..self.model.num_distortion() {
+            d_params[(0, num_focal + 2 + k)] = focal_px.x * d_coefficients[(0, k)];
+            d_params[(1, num_focal + 2 + k)] = focal_px.y * d_coefficients[(1, k)];
+        }
+        d_params
     }
 }
 

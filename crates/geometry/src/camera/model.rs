@@ -136,6 +136,11 @@ impl CameraModel {
         }
     }
 
+    /// The names of all models, for messages.
+    pub fn names() -> String {
+        Self::ALL.map(Self::name).join(", ")
+    }
+
     /// The model of a name in COLMAP's spelling.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|model| model.name() == name)

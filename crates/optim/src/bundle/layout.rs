@@ -176,12 +176,7 @@ pub(super) struct Cameras {
 impl Cameras {
     /// The cameras where a problem starts.
     pub fn of(problem: &BundleProblem) -> Self {
-        Self::from(AdjustedCameras {
-            poses: problem.poses.clone(),
-            intrinsics: problem.intrinsics.clone(),
-            biases_m: problem.position_biases.iter().map(|bias| bias.bias_m).collect(),
-            landmarks: problem.landmarks.iter().map(|landmark| landmark.x_in_world).collect(),
-        })
+        Self::from(AdjustedCameras::of(problem))
     }
 
     /// The cameras after a step of the reduced system, or `None` where intrinsics lose their meaning.

@@ -1,6 +1,8 @@
 //! Options of a bundle adjustment.
 
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
+use terrane_geometry::Camera;
 
 use super::BundleError;
 use crate::Loss;
@@ -30,6 +32,15 @@ pub enum BehindCamera {
     /// They count as the formula of a perspective camera says, which does not look at the sign of the depth: what problems
     /// of the literature (BAL) mean by their cost.
     Mirror,
+}
+
+impl BehindCamera {
+    /// Whether a point in the camera's frame counts as the point on the other side of the centre: a perspective formula
+    /// divides by z, whatever its sign, and shows both at one pixel.
+    #[inline(always)]
+    pub fn mirrors(self, camera: &Camera, x_in_cam: &Vector3<f64>) -> bool {
+        self == Self::Mirror && x_in_cam.z < 0.0 && camera.model.is_perspective()
+    }
 }
 
 /// How the linear systems of an adjustment are solved.

@@ -170,6 +170,16 @@ pub struct AdjustedCameras {
 }
 
 impl AdjustedCameras {
+    /// Where a problem starts.
+    pub(super) fn of(problem: &BundleProblem) -> Self {
+        Self {
+            poses: problem.poses.clone(),
+            intrinsics: problem.intrinsics.clone(),
+            biases_m: problem.position_biases.iter().map(|bias| bias.bias_m).collect(),
+            landmarks: problem.landmarks.iter().map(|landmark| landmark.x_in_world).collect(),
+        }
+    }
+
     /// Takes them over into the problem.
     pub fn put_into(self, problem: &mut BundleProblem) {
         problem.poses = self.poses;

@@ -13,19 +13,7 @@ pub(super) fn project(
     x_in_cam: &Vector3<f64>,
     behind: BehindCamera,
 ) -> Option<Vector2<f64>> {
-    match behind {
-        // The formula divides by z, whatever its sign: the point on the other side of the centre has the same image.
-        BehindCamera::Mirror if x_in_cam.z < 0.0 && camera.model.is_perspective() => {
-            camera.project(&-x_in_cam)
-        }
-        _ => camera.project(x_in_cam),
-    }
-}
-
-/// What a projection differs from an observation by, in pixels; across the seam of a panorama the short way round.
-#[inline(always)]
-pub(super) fn residual_px(camera: &Camera, xy_px: &Vector2<f64>, observed_px: [f32; 2]) -> [f64; 2] {
-    camera.residual_px(xy_px, &Vector2::new(f64::from(observed_px[0]), f64::from(observed_px[1]))).into()
+    if behind.mirrors(camera, x_in_cam) { camera.project(&-x_in_cam) } else { camera.project(x_in_cam) }
 }
 
 /// The same, with derivatives.
@@ -35,12 +23,16 @@ pub(super) fn project_with_jacobian(
     x_in_cam: &Vector3<f64>,
     behind: BehindCamera,
 ) -> Option<Projection> {
-    match behind {
-        BehindCamera::Mirror if x_in_cam.z < 0.0 && camera.model.is_perspective() => {
-            let mut projection = camera.project_with_jacobian(&-x_in_cam)?;
-            projection.d_point = -projection.d_point;
-            Some(projection)
-        }
-        _ => camera.project_with_jacobian(x_in_cam),
+    if !behind.mirrors(camera, x_in_cam) {
+        return camera.project_with_jacobian(x_in_cam);
     }
+    let mut projection = camera.project_with_jacobian(&-x_in_cam)?;
+    projection.d_point = -projection.d_point;
+    Some(projection)
+}
+
+/// What a projection differs from an observation by, in pixels; across the seam of a panorama the short way round.
+#[inline(always)]
+pub(super) fn residual_px(camera: &Camera, xy_px: &Vector2<f64>, observed_px: [f32; 2]) -> [f64; 2] {
+    camera.residual_px(xy_px, &Vector2::new(f64::from(observed_px[0]), f64::from(observed_px[1]))).into()
 }

@@ -133,10 +133,9 @@ impl Reduced {
         let stiffness = self.diagonal[offset + 3..offset + 6].iter().sum::<f64>().max(1.0);
         let columns = n.iter().map(|along| [*along, 0.0, 0.0]).collect();
         let block = TermBlock { block: variable, local: 3, columns };
-        for (i, column) in block.columns.iter().enumerate() {
-            self.diagonal[offset + 3 + i] += stiffness * column[0] * column[0];
-        }
-        self.add_product(stiffness, &block, &block);
+        let blocks = [block].into_iter().collect();
+        let term = Term { rows: 1, residual: [0.0; 3], weight: stiffness, cost: 0.0, blocks };
+        self.add_term(context, &term);
     }
 
     /// The step of the cameras, or `None` when the system is not positive definite.

@@ -1,16 +1,16 @@
 //! Ingest: every file once, for its hash and its metadata.
 
 use rayon::prelude::*;
-use terrane_frontend::cameras::{self, GivenCamera};
+use terrane_frontend::cameras;
 use terrane_frontend::metadata::{self, ImageMetadata};
 use terrane_scene::codec::{ArchiveWriter, Kind};
 use terrane_scene::{ImageRecord, ImageTable, RejectedImage};
 
 use super::inputs::MaskFile;
 use super::{ExecutionContext, Inputs, Made, import, read};
-use crate::PipelineError;
 use crate::listing::Listing;
 use crate::masks::MaskNames;
+use crate::{CameraOverride, PipelineError};
 
 /// Files that are in memory together at most, whatever the number of threads: they are read in runs of this length.
 const FILES_AT_ONCE: usize = 16;
@@ -101,13 +101,7 @@ fn table(
     usable: Vec<Usable>,
     rejected: Vec<RejectedImage>,
 ) -> Result<ImageTable, PipelineError> {
-    let given = match &context.config.camera {
-        Some(camera) => Some(
-            GivenCamera::new(camera.model, camera.params.clone())
-                .map_err(|error| PipelineError::invalid_input(error.to_string()))?,
-        ),
-        None => None,
-    };
+    let given = context.config.camera.as_ref().map(CameraOverride::given).transpose()?;
     let (hashes, described): (Vec<String>, Vec<(String, ImageMetadata)>) =
         usable.into_iter().map(|file| (file.content_hash, (file.path, file.metadata))).unzip();
     let (cameras, camera_of) = cameras::group(&described, given.as_ref());

@@ -192,11 +192,13 @@ impl<'a> Driver<'a> {
         cost
     }
 
-    /// Adds what priors and marks say; their cost.
-    fn add_terms(&mut self) -> f64 {
+    /// Adds what priors and marks say; their cost. Without `anew` the cameras have not moved.
+    fn add_terms(&mut self, anew: bool) -> f64 {
         let side = self.side.as_ref();
         let sums = &mut self.sums;
-        sums.terms = terms(&side.problem, &side.layout, &self.cameras, &side.options);
+        if anew {
+            sums.terms = terms(&side.problem, &side.layout, &self.cameras, &side.options);
+        }
         known::for_each_unknown(side, &sums.terms, |unknown, slope, diagonal| {
             sums.descent[unknown] -= slope;
             sums.reduced_descent[unknown] -= slope;
@@ -249,7 +251,7 @@ impl Backend for Driver<'_> {
         let (width, of) = (self.side.map.width(), |poses: &Vec<u32>| poses.len());
         let lengths = self.poses.iter().map(of).map(|n| 2 + n * (3 * width + blocks * packed(width)));
         check_lengths(&answers, lengths)?;
-        let cost = self.gather(&answers) + self.add_terms();
+        let cost = self.gather(&answers) + self.add_terms(anew);
         let tiny = f64::MIN_POSITIVE.sqrt();
         for d in &mut self.sums.diagonal {
             // A parameter without any effect stays where it is.

@@ -114,7 +114,7 @@ impl CameraSide {
 
     /// The way back from [`CameraSide::flatten_cameras`].
     pub(super) fn unflatten(&self, numbers: &[f64]) -> Result<Cameras, BundleError> {
-        let mut cameras = Cameras::of(&self.problem);
+        let mut cameras = AdjustedCameras::of(&self.problem);
         let params: usize = cameras.intrinsics.iter().map(|camera| camera.params().len()).sum();
         let kept = cameras.biases_m.len() + cameras.landmarks.len();
         if numbers.len() != 7 * cameras.poses.len() + params + 3 * kept {
@@ -136,7 +136,7 @@ impl CameraSide {
         }
         let targets = cameras.biases_m.iter_mut().chain(&mut cameras.landmarks);
         targets.zip(rest.as_chunks::<3>().0).for_each(|(target, x)| *target = Vector3::from(*x));
-        Ok(Cameras::from(AdjustedCameras::from(cameras)))
+        Ok(cameras.into())
     }
 
     pub(super) fn frame<'a>(&'a self, cameras: &'a Cameras) -> Frame<'a> {

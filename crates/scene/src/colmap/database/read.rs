@@ -387,10 +387,9 @@ fn camera(
 ) -> Result<Result<Camera, String>, SceneError> {
     let known = i32::try_from(model).ok().and_then(CameraModel::from_colmap_id);
     let Some(model) = known else {
-        let names: Vec<_> = CameraModel::ALL.iter().map(|model| model.name()).collect();
         return Ok(Err(format!(
             "its camera has COLMAP's model number {model}, which terrane does not have: it has {}",
-            names.join(", ")
+            CameraModel::names()
         )));
     };
     let size = size.map(|length| u32::try_from(length).ok().filter(|length| *length > 0));
